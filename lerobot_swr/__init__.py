@@ -1,0 +1,16 @@
+"""Policies that reproduce and let you steer the diversity of demonstrations, inside LeRobot.
+
+Reading order, along the way data takes:
+
+* `lerobot_swr.envs`: the simulated tasks (mazes, ...).
+* `lerobot_swr.demos`: scripted demonstrators and the recipes that write LeRobot datasets.
+* `lerobot_swr.trajectories`: episodes of a dataset as arrays.
+* `lerobot_swr.similarity`, `lerobot_swr.sampling`, `lerobot_swr.styles`: the method.
+* `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies.
+* `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports.
+* `lerobot_swr.cli`: the ``lerobot-swr-*`` commands.
+
+Importing this package registers the environment, policy and optimizer configurations with LeRobot.
+"""
+
+__version__ = "0.1.0"

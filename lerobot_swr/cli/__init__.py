@@ -1,0 +1,1 @@
+"""The `lerobot-swr-*` commands: thin draccus entry points, one module each."""

@@ -1,0 +1,1 @@
+"""Scripted demonstrators and the recipes that turn them into LeRobot datasets."""

@@ -1,0 +1,47 @@
+"""A dataset recipe: the name, the features and the seeded source of demonstrations of one dataset."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lerobot_swr.behaviors import BehaviorRule
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One recorded episode.
+
+    Attributes:
+        observations: LeRobot feature name to a float32 array (T, d): the state in which each action was taken.
+            The last one already fulfils the task, so that the behaviour can be read from the states alone.
+        actions: (T, A) float32, the action taken in each state, in the environment's units.
+    """
+
+    observations: Mapping[str, np.ndarray]
+    actions: np.ndarray
+
+
+@dataclass(frozen=True)
+class DatasetRecipe:
+    """How one of the package's datasets is made.
+
+    Attributes:
+        name: What ``lerobot-swr-dataset --task=`` calls it.
+        instruction: Natural-language task stored with every frame.
+        fps: Control rate of the environment, in Hz.
+        robot_type: Stored in the dataset's metadata.
+        features: LeRobot feature name (observations and ``action``) to the names of its dimensions.
+        n_episodes: Number of demonstrations.
+        demonstrations: Maps a seed to the episodes, in their order in the dataset. Deterministic in the seed.
+        behavior_rule: Labels an episode of this dataset.
+    """
+
+    name: str
+    instruction: str
+    fps: int
+    robot_type: str
+    features: Mapping[str, tuple[str, ...]]
+    n_episodes: int
+    demonstrations: Callable[[int], Iterator[Demonstration]]
+    behavior_rule: BehaviorRule

@@ -1,0 +1,54 @@
+"""What every task of this package shares as a LeRobot environment configuration."""
+
+import abc
+from dataclasses import dataclass
+from functools import partial
+
+import gymnasium as gym
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+
+from lerobot_swr.behaviors import BehaviorRule
+
+
+@dataclass
+class TaskEnvConfig(EnvConfig):
+    """A LeRobot environment that also knows which behaviour an episode shows.
+
+    Subclasses register their Gymnasium id in the module that defines them, because the worker processes of
+    `AsyncVectorEnv` import nothing else.
+    """
+
+    @property
+    def package_name(self) -> str:
+        """Module whose import registers the Gymnasium id."""
+        return type(self).__module__
+
+    @abc.abstractmethod
+    def behavior_rule(self) -> BehaviorRule:
+        """The pure rule that labels an episode of this task from its states."""
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
+        """LeRobot's vector environment for this task, whose finished episodes keep their last observation.
+
+        Unlike LeRobot's default, a finished sub-environment is frozen instead of being reset at once: its last
+        state is needed to label the behaviour, and it costs nothing while slower episodes go on.
+        """
+        make_one = partial(
+            gym.make, self.gym_id, disable_env_checker=self.disable_env_checker, **self.gym_kwargs
+        )
+        env_fns = [freeze_after_episode_end(make_one) for _ in range(n_envs)]
+        if use_async_envs and n_envs > 1:
+            vector_env: gym.vector.VectorEnv = AsyncVectorEnv(
+                env_fns, autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver"
+            )
+        else:
+            vector_env = SyncVectorEnv(env_fns, autoreset_mode=AutoresetMode.SAME_STEP)
+        return {self.type: {0: vector_env}}
+
+    def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
+        """The fastest vector environment of this task in this process, for behaviour evaluation."""
+        return self.create_envs(n_envs)[self.type][0]

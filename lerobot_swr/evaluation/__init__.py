@@ -1,0 +1,1 @@
+"""Rollouts, behaviours, metrics, statistics, pictures and reports."""

@@ -1,0 +1,1 @@
+"""The policies BC, ZBC and WZBC as LeRobot configuration / modeling / processor trio."""
