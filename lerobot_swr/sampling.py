@@ -7,9 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lerobot_swr.similarity import Normalization, check_beta, normalize_distances
+from lerobot_swr.similarity import Normalization, check_beta, check_normalization
 
 PartnerSampling = Literal["uniform", "weighted"]
+
+MAX_INSPECTED_STYLES = 64
 
 
 @dataclass(frozen=True)
@@ -34,8 +36,8 @@ class SimilarityWeightedSampler:
     j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and a lower variance. Draws come
     from torch's global generator, which LeRobot saves and restores with a checkpoint.
 
-    Only *candidates* are drawn: episodes that take part in training. The normalization of ν, too, is over the
-    candidates.
+    Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`. The
+    normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
 
     Args:
         distances: (N, N) distances of the episodes.
@@ -59,29 +61,33 @@ class SimilarityWeightedSampler:
         check_beta(beta)
         check_probability(p)
         check_partner_sampling(partner_sampling)
-        self.distances, self.beta, self.p = distances, beta, p
+        check_normalization(normalization)
+        self.beta, self.p = beta, p
         self.normalization, self.partner_sampling = normalization, partner_sampling
-        self.set_candidates(torch.ones(len(distances), dtype=torch.bool))
+        self._distances = torch.from_numpy(distances).to(torch.float32)  # (N, N)
+        self.candidates = torch.zeros(len(distances), dtype=torch.bool)
+        self._largest = torch.zeros(len(distances))  # (N,) largest distance to a candidate
+        self.effective_demos = 0.0
 
     def set_candidates(self, candidates: Tensor) -> None:
-        """Restrict the draw to the episodes marked in `candidates`, (N,) bool."""
-        self.candidates = candidates.clone()
-        device = candidates.device
-        chosen = candidates.cpu().numpy()
-        self.n_candidates = int(chosen.sum())
-        distances = np.where(chosen[:, None] & chosen[None, :], self.distances, 0.0)
-        nu = normalize_distances(distances, self.normalization)
-        log_weights = torch.from_numpy(-self.beta * nu).to(torch.float32)
-        self._log_weights = log_weights.to(device)  # (N, N), log W
-        excluded = torch.from_numpy(~chosen)[None, :] | torch.eye(len(nu), dtype=torch.bool)
-        self._partner_log_weights = log_weights.masked_fill(excluded, -torch.inf).to(device)
-        self._candidate_list = candidates.nonzero().squeeze(1)  # (M,)
-        self._rank = candidates.long().cumsum(0) - 1  # (N,), place of a candidate in that list
-        # Kish's effective sample size of the demonstrations that teach a style, 1 (its own) to M.
-        weights = np.exp(-self.beta * nu[np.ix_(chosen, chosen)])  # (M, M), W(τ_i, τ_j)
-        self.effective_demos = float(
-            np.mean(weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)) if self.n_candidates else 0.0
-        )
+        """Restrict the draw to the episodes marked in `candidates`, (N,), non-zero where marked."""
+        marked = candidates.bool()
+        if torch.equal(marked, self.candidates):
+            return
+        self._distances = self._distances.to(marked.device)
+        self.candidates = marked.clone()
+        self._candidate_list = marked.nonzero().squeeze(1)  # (M,)
+        self._place = marked.long().cumsum(0) - 1  # (N,) place of a candidate in that list
+        among = self._distances[:, self._candidate_list]  # (N, M)
+        self._largest = among.amax(dim=1)
+        if self.normalization == "global":
+            self._largest = self._largest[self._candidate_list].amax().expand(len(marked))
+        self.effective_demos = self._effective_demos()
+
+    def nu(self, i: Tensor, j: Tensor) -> Tensor:
+        """ν(τ_i, τ_j) of pairs of episodes, (B,) each or broadcastable to each other."""
+        largest = self._largest[i]
+        return torch.where(largest > 0, self._distances[i, j] / largest, 0.0)
 
     def draw(self, episodes: Tensor) -> Pairs:
         """Draw a partner for every frame.
@@ -89,24 +95,34 @@ class SimilarityWeightedSampler:
         Args:
             episodes: (B,) int64, episode i of each frame; all of them candidates.
         """
-        ones = torch.ones(len(episodes), device=episodes.device)
-        if self.p == 0 or self.n_candidates < 2:
+        others = len(self._candidate_list) - 1
+        if self.p == 0 or others < 1:
+            ones = torch.ones(len(episodes), device=episodes.device)
             return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
         relabelled = torch.rand(len(episodes), device=episodes.device) < self.p
         if self.partner_sampling == "uniform":
-            place = torch.randint(self.n_candidates - 1, episodes.shape, device=episodes.device)
-            place = place + (place >= self._rank[episodes])  # skips the frame's own episode
+            place = torch.randint(others, episodes.shape, device=episodes.device)
+            place = place + (place >= self._place[episodes])  # skips the frame's own episode
             partners = self._candidate_list[place]
-            weights = self._log_weights[episodes, partners].exp()
+            weights = torch.exp(-self.beta * self.nu(episodes, partners))
         else:
-            log_weights = self._partner_log_weights[episodes]  # (B, N)
-            partners = torch.multinomial(log_weights.softmax(dim=1), 1).squeeze(1)
-            weights = log_weights.logsumexp(dim=1).exp() / (self.n_candidates - 1)
+            log_weights = -self.beta * self.nu(episodes[:, None], self._candidate_list)  # (B, M)
+            log_weights[torch.arange(len(episodes)), self._place[episodes]] = -torch.inf
+            partners = self._candidate_list[torch.multinomial(log_weights.softmax(dim=1), 1).squeeze(1)]
+            weights = log_weights.logsumexp(dim=1).exp() / others
         return Pairs(
-            torch.where(relabelled, partners, episodes),
-            torch.where(relabelled, weights, ones),
-            relabelled,
+            torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
         )
+
+    def _effective_demos(self) -> float:
+        """Kish's effective number of demonstrations that teach a style, from 1 (its own alone) to M.
+
+        (Σ_i W_ij)² / Σ_i W_ij², averaged over styles j; over an even selection of them where there are many.
+        """
+        stride = -(-len(self._candidate_list) // MAX_INSPECTED_STYLES)
+        styles = self._candidate_list[::stride]
+        weights = torch.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
+        return float((weights.sum(dim=0).square() / weights.square().sum(dim=0)).mean())
 
 
 def check_probability(p: float) -> None:

@@ -53,13 +53,11 @@ class StyleCookbook(nn.Module):
         """Number of episodes, trained or not."""
         return self.embedding.num_embeddings
 
-    def mark_trained(self, episodes: Tensor) -> bool:
-        """Remember that the (B,) `episodes` were trained on, in every process; tells whether any was new."""
-        before = int(self.trained.sum())
+    def mark_trained(self, episodes: Tensor) -> None:
+        """Remember, in every process, that the (B,) `episodes` were trained on."""
         self.trained[episodes] = 1
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.all_reduce(self.trained, torch.distributed.ReduceOp.MAX)
-        return int(self.trained.sum()) != before
 
     def allowed(self) -> Tensor:
         """(M,) int64, the episodes whose styles may be drawn.
