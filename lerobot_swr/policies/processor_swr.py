@@ -1,9 +1,8 @@
 """Pre- and post-processing of ``bc``, ``zbc`` and ``wzbc``: LeRobot's default pipelines."""
 
-import logging
 from typing import Any
 
-import torch
+import numpy as np
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import PolicyProcessorPipeline, make_default_pre_post_processors
 
@@ -14,9 +13,6 @@ Pipelines = tuple[
     PolicyProcessorPipeline[PolicyAction, PolicyAction],
 ]
 Statistics = dict[str, dict[str, Any]]
-
-CONSTANT_STD = 1e-6  # relative to the mean's size; below it a dimension counts as constant
-
 
 def make_bc_pre_post_processors(config: BCConfig, dataset_stats: Statistics | None = None) -> Pipelines:
     """LeRobot's default pipelines; constant dimensions are centred instead of being blown up."""
@@ -37,12 +33,8 @@ def _with_unit_std_where_constant(config: BCConfig, stats: Statistics | None) ->
         return None
     fixed = dict(stats)
     for key in {**(config.input_features or {}), **(config.output_features or {})}:
-        if "std" not in stats.get(key, {}):
+        if not {"std", "min", "max"} <= stats.get(key, {}).keys():
             continue
-        mean = torch.as_tensor(stats[key]["mean"], dtype=torch.float64)
-        std = torch.as_tensor(stats[key]["std"], dtype=torch.float64)
-        constant = std <= CONSTANT_STD * mean.abs().clamp(min=1.0)
-        if constant.any():
-            logging.info("%s: dimensions %s are constant", key, constant.nonzero().flatten().tolist())
-            fixed[key] = {**stats[key], "std": torch.where(constant, 1.0, std).to(torch.float32).numpy()}
+        constant = np.asarray(stats[key]["min"]) == np.asarray(stats[key]["max"])
+        fixed[key] = {**stats[key], "std": np.where(constant, 1.0, stats[key]["std"])}
     return fixed

@@ -6,6 +6,8 @@ import gymnasium as gym
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
@@ -100,6 +102,20 @@ class Maze2DEnvConfig(TaskEnvConfig):
     def behavior_rule(self) -> BehaviorRule:
         """The checkpoints in the order in which they are first passed."""
         return MazeBehaviorRule(get_layout(self.task or ""))
+
+    def draw_scene(self, axes: Axes) -> None:
+        """Walls, door numbers and the goal."""
+        layout = get_layout(self.task or "")
+        for wall in layout.walls:
+            edges = [0.0]
+            for door in sorted(wall.doors, key=lambda door: door.x):
+                edges += [door.x - door.half_width, door.x + door.half_width]
+                axes.text(door.x, wall.y, str(door.checkpoint), color="0.5", ha="center", va="center")
+            edges.append(1.0)
+            for left, right in zip(edges[::2], edges[1::2], strict=True):
+                axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")
+        axes.add_patch(Circle(layout.goal, layout.goal_radius, fill=False, color="tab:green", linewidth=2))
+        axes.set(xlim=(0, 1), ylim=(0, 1))
 
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
         """All agents in one array."""
