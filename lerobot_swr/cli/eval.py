@@ -96,7 +96,8 @@ class EvalCommand:
 @parser.wrap()
 def evaluate(cfg: EvalCommand) -> None:
     """Evaluate a checkpoint by rollouts, or offline without an environment."""
-    assert cfg.policy is not None and cfg.output_dir is not None
+    assert cfg.policy is not None
+    assert cfg.output_dir is not None
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
     trajectories = load_reference(cfg.dataset, checkpoint)
     title = f"{cfg.policy.type} on {trajectories.name}"

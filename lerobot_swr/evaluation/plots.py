@@ -58,9 +58,7 @@ def plot_behaviors(
     figure.savefig(path, dpi=110)
 
 
-def draw_paths(
-    axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig
-) -> None:
+def draw_paths(axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig) -> None:
     """Paths in the scene, coloured by behaviour."""
     if isinstance(env_cfg, TaskEnvConfig):
         env_cfg.draw_scene(axes)
@@ -89,7 +87,11 @@ def draw_histograms(axes: Axes, reference: Histogram, shown: Histogram) -> None:
 
 
 def plot_offline(
-    path: Path, errors: Mapping[str, np.ndarray], phase: np.ndarray, describe: Callable[[str], str], title: str
+    path: Path,
+    errors: Mapping[str, np.ndarray],
+    phase: np.ndarray,
+    describe: Callable[[str], str],
+    title: str,
 ) -> None:
     """Action error by kind of style: over all frames, and along the episode.
 

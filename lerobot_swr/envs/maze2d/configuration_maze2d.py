@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
-from lerobot_swr.envs.maze2d.env import FPS, MazeAgents, Maze2DVectorEnv
+from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import get_layout
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
