@@ -52,9 +52,7 @@ def test_actions_beyond_the_range_are_clipped():
     env = Maze2DEnv()
     start, _ = env.reset(seed=0)
     after, *_ = env.step(np.array([5.0, -0.5]))
-    np.testing.assert_allclose(
-        after["agent_pos"] - start["agent_pos"], [MAX_STEP, -MAX_STEP / 2], atol=1e-6
-    )
+    np.testing.assert_allclose(after["agent_pos"] - start["agent_pos"], [MAX_STEP, -MAX_STEP / 2], atol=1e-6)
 
 
 def test_noise_has_the_stated_scale():
