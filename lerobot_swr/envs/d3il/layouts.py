@@ -1,0 +1,70 @@
+"""Where things stand in the two D3IL tasks and when they are done: numbers only, in metres and radians.
+
+Source: Jia et al., ICLR 2024, and measurements of the running benchmark. The simulator-free behaviour rules and
+the environments both read them here.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+CONTROL_PERIOD_S = 0.035
+"""Time between two actions: 35 ms of simulation."""
+
+FPS = 29
+"""Control rate as LeRobot stores it, in whole Hz; the exact rate is 1 / 0.035 s = 28.57 Hz."""
+
+ACTION_LIMIT_M = 0.05
+"""Largest change of the desired position per step and axis; actions beyond are clipped."""
+
+
+class Obstacle(NamedTuple):
+    """A vertical cylinder that stands on z = 0, centred there; it cannot be moved."""
+
+    name: str
+    x: float
+    y: float
+    radius: float
+    half_height: float
+
+
+# --- Avoiding: find a way through three levels of cylinders to the finish line.
+
+OBSTACLES = (
+    Obstacle("level1", 0.5, -0.1, 0.03, 0.07),
+    Obstacle("level2_low_x", 0.425, 0.08, 0.025, 0.1),
+    Obstacle("level2_high_x", 0.575, 0.08, 0.025, 0.1),
+    Obstacle("level3_low_x", 0.35, 0.26, 0.025, 0.1),
+    Obstacle("level3_mid_x", 0.5, 0.26, 0.025, 0.1),
+    Obstacle("level3_high_x", 0.65, 0.26, 0.025, 0.1),
+)
+ROD_RADIUS = 0.01
+FINISH_LINE_Y = 0.35
+AVOIDING_EPISODE_LENGTH = 250
+LEVEL_BAND = 0.03
+"""Levels 1 and 2 are judged when the tool first comes this close to their obstacles' y, level 3 when it passes."""
+
+AVOIDING_START_JOINTS = (
+    -0.35640868, 0.42944545, -0.1350106, -2.05465189, 0.09357822, 2.48071794, 0.23250676,
+)  # fmt: skip
+AVOIDING_START_TOOL = (0.52492847, -0.27973673, 0.12235931)
+"""Tool position in the start pose. Its height is the desired height throughout an avoiding episode."""
+
+# --- Aligning: push or pull an open box onto a target pose.
+
+ALIGNING_EPISODE_LENGTH = 400
+ALIGNING_START_JOINTS = (
+    -0.39275836, 0.32177812, -0.21250285, -1.84358136, 0.08314888, 2.16034406, 0.14479522,
+)  # fmt: skip
+ALIGNING_START_TOOL = (0.52495781, -0.34881811, 0.25159789)
+BOX_SIDE = 0.11
+"""Outer side of the box; its walls are 0.01 thick and the box is open at the top."""
+BOX_POSITION_RANGE = ((0.4, 0.6), (-0.25, -0.1))
+TARGET_POSITION_RANGE = ((0.4, 0.6), (0.2, 0.35))
+ANGLE_RANGE = (-np.pi / 2, np.pi / 2)
+POSITION_TOLERANCE = 0.018
+"""Largest 3-D distance of the box to its target. The box rests 9.2 mm below it, which leaves 15.5 mm in the plane."""
+ROTATION_TOLERANCE = 0.048 * np.pi
+"""Largest rotation between the box and its target: 8.64 degrees."""
+INSIDE_DISTANCE = 0.051
+"""The tool works from inside the box if it is closer than this to the box's centre, in the plane."""
