@@ -276,7 +276,7 @@ def control(
         planned_joints: (7,) result of the last inverse kinematics in rad, updated in place.
         qpos: (>= 9,) measured joint positions, arm then fingers.
         qvel: (>= 9,) measured joint velocities.
-        bias: (>= 9,) gravity and Coriolis forces, as the last physics step left them.
+        bias: (>= 7,) gravity and Coriolis forces, as the last physics step left them; the arm's are compensated.
         ctrl: (9,) output in N m and N.
     """
     previous = planned_joints.copy()
@@ -292,6 +292,4 @@ def control(
     middle = 0.5 * (qpos[7] + qpos[8])
     for finger in (7, 8):
         opening = _FINGER_STIFFNESS * (_FINGER_OPENING - qpos[finger]) - _FINGER_DAMPING * qvel[finger]
-        ctrl[finger] = (
-            _FINGER_STIFFNESS * (middle - qpos[finger]) + _clip(opening, _FINGER_FORCE_LIMIT) + bias[finger]
-        )
+        ctrl[finger] = _FINGER_STIFFNESS * (middle - qpos[finger]) + _clip(opening, _FINGER_FORCE_LIMIT)

