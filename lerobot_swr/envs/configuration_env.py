@@ -1,13 +1,16 @@
 """What every task of this package shares as a LeRobot environment configuration."""
 
 import abc
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
+from matplotlib.axes import Axes
 
 from lerobot_swr.behaviors import BehaviorRule
 
@@ -28,6 +31,13 @@ class TaskEnvConfig(EnvConfig):
     @abc.abstractmethod
     def behavior_rule(self) -> BehaviorRule:
         """The pure rule that labels an episode of this task from its states."""
+
+    def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(T, 2) path of an episode, as pictures draw it: by default the first two state dimensions."""
+        return observations["observation.state"][:, :2]
+
+    def draw_scene(self, axes: Axes) -> None:
+        """Draw what does not move (walls, obstacles) behind the paths; by default nothing."""
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False

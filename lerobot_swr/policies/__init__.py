@@ -1,1 +1,1 @@
-"""The policies BC, ZBC and WZBC as LeRobot configuration / modeling / processor trio."""
+"""The policies BC, ZBC and WZBC as LeRobot's configuration / modeling / processor trio."""

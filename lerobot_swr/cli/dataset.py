@@ -1,0 +1,49 @@
+"""``lerobot-swr-dataset``: write one of the package's demonstration datasets.
+
+Example:
+    lerobot-swr-dataset --task=medium_maze-only_forward --root=data/only_forward --seed=0
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lerobot.configs import parser
+from lerobot.utils.utils import init_logging
+
+from lerobot_swr.cli.errors import explain_errors
+from lerobot_swr.demos.catalog import get_recipe
+from lerobot_swr.demos.dataset_writer import write_dataset
+
+
+@dataclass
+class DatasetCommand:
+    """Options of ``lerobot-swr-dataset``."""
+
+    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast.
+    task: str
+    # Folder of the new dataset.
+    root: Path
+    # Seed of the demonstrations.
+    seed: int = 0
+    # Name of the dataset for LeRobot; default: local/<task>.
+    repo_id: str | None = None
+    # Replace a dataset that is already in the folder.
+    overwrite: bool = False
+
+
+@parser.wrap()
+def write(cfg: DatasetCommand) -> None:
+    """Write the dataset and print its behaviour histogram."""
+    recipe = get_recipe(cfg.task)
+    histogram = write_dataset(recipe, cfg.root, cfg.seed, cfg.repo_id, cfg.overwrite)
+    total = sum(histogram.values())
+    print(f"{total} episodes of {recipe.name} in {cfg.root}")
+    for behavior, count in histogram.most_common():
+        print(f"  {behavior:>12} {count:4d}  {'#' * round(40 * count / max(histogram.values()))}")
+
+
+@explain_errors
+def main() -> None:
+    """Entry point."""
+    init_logging()
+    write()

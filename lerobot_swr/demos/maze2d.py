@@ -1,0 +1,182 @@
+"""Scripted demonstrators of Maze2D: human-like walks through given doors, and the datasets made of them.
+
+A demonstration is a smooth path through points inside its doors and through free points between the walls,
+followed at a smoothly varying speed with a little hand tremor, in the real environment. All constants below
+were fixed before any method was trained on the datasets; units are shares of the maze's side.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+
+from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
+from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
+from lerobot_swr.envs.maze2d.dynamics import MAX_STEP
+from lerobot_swr.envs.maze2d.env import FPS, INSTRUCTION, MazeAgents
+from lerobot_swr.envs.maze2d.layouts import MazeLayout, get_layout
+
+DOOR_SPREAD = 0.75  # paths use this share of a door's width
+PATH_SPREAD = 0.05  # standard deviation of the free points between the walls
+SPEED_WOBBLE = 0.10  # relative standard deviation of the speed along the way
+TREMOR = 0.06  # standard deviation of the hand's noise, in units of the largest step
+LOOKAHEAD = 1.5  # how far ahead the hand aims, in steps
+MEMORY = 0.9  # correlation of wobble and tremor from one step to the next
+FRAMES_AT_GOAL = 3  # frames recorded inside the goal disc, as a human who stops the recording would
+
+SpeedRule = Callable[[np.random.Generator, float], float]
+"""Draws the mean speed of one demonstration (side lengths per step) given the length of its path."""
+
+
+def forward_path(checkpoints: str, layout: MazeLayout, rng: np.random.Generator) -> np.ndarray:
+    """A smooth path from the start through one door of every wall to the goal.
+
+    Args:
+        checkpoints: Behaviour label, one door per wall, e.g. ``"6410"``.
+        layout: The maze.
+        rng: Source of the variation.
+
+    Returns:
+        (P, 2) densely spaced points; y grows strictly, so no wall is crossed outside its door.
+    """
+    points = [np.array(layout.start)]
+    for wall, checkpoint in zip(layout.walls, checkpoints[:-1], strict=True):
+        door = next(door for door in wall.doors if str(door.checkpoint) == checkpoint)
+        x = door.x + DOOR_SPREAD * door.half_width * rng.uniform(-1, 1)
+        points.append(np.array([x, wall.y]))
+    goal_jitter = 0.4 * layout.goal_radius * rng.uniform(-1, 1, size=2)
+    points.append(np.array(layout.goal) + goal_jitter)
+
+    with_free_points = [points[0]]
+    for before, after in zip(points[:-1], points[1:], strict=True):
+        share = rng.uniform(0.35, 0.65)
+        free = before + share * (after - before)
+        free[0] = np.clip(free[0] + PATH_SPREAD * rng.standard_normal(), 0.03, 0.97)
+        with_free_points += [free, after]
+    x, y = np.array(with_free_points).T
+    dense_y = np.linspace(y[0], y[-1], 2000)
+    return np.stack([PchipInterpolator(y, x)(dense_y), dense_y], axis=1)
+
+
+def walk(path: np.ndarray, speed: float, task: str, rng: np.random.Generator) -> Demonstration:
+    """Follow a path in the environment.
+
+    Args:
+        path: (P, 2) densely spaced points.
+        speed: Mean speed, in side lengths per step.
+        task: Name of the maze.
+        rng: Source of the variation.
+
+    Returns:
+        The demonstration; its last `FRAMES_AT_GOAL` frames lie in the goal disc.
+
+    Raises:
+        RuntimeError: If the goal is not reached, i.e. the path cannot be followed.
+    """
+    agents = MazeAgents(task, "fixed", 0.0, 0.0, sticky_walls=False)
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    position, progress = path[0][None], 0.0
+    wobble, tremor = 0.0, np.zeros(2)
+    states, actions, frames_at_goal = [], [], 0
+    fresh = np.sqrt(1 - MEMORY**2)
+    for _ in range(20 * int(arc[-1] / speed)):
+        wobble = MEMORY * wobble + fresh * rng.standard_normal()
+        tremor = MEMORY * tremor + fresh * rng.standard_normal(2)
+        pace = speed * max(0.3, 1 + SPEED_WOBBLE * wobble)
+
+        near = (arc >= progress - 3 * speed) & (arc <= progress + 3 * speed)
+        progress = arc[near][np.linalg.norm(path[near] - position, axis=1).argmin()]
+        aim = min(progress + LOOKAHEAD * pace, arc[-1])
+        target = np.array([np.interp(aim, arc, path[:, 0]), np.interp(aim, arc, path[:, 1])])
+        direction = target - position[0]
+        distance = np.linalg.norm(direction)
+        step = direction * min(1.0, pace / max(distance, 1e-9))
+        action = np.clip(step / MAX_STEP + TREMOR * tremor, -1, 1).astype(np.float32)
+
+        states.append(agents.observe(position))
+        actions.append(action)
+        frames_at_goal += bool(np.linalg.norm(position[0] - agents.layout.goal) <= agents.layout.goal_radius)
+        if frames_at_goal == FRAMES_AT_GOAL:
+            observations = {
+                "observation.state": np.concatenate([state["agent_pos"] for state in states]),
+                "observation.environment_state": np.concatenate(
+                    [state["environment_state"] for state in states]
+                ),
+            }
+            return Demonstration(observations, np.stack(actions))
+        position, _ = agents.step(position, action[None], [])
+    raise RuntimeError(f"the demonstrator did not reach the goal of {task!r}")
+
+
+def steady(rng: np.random.Generator, path_length: float) -> float:
+    """Moderately varied speed, independent of the path."""
+    return 0.018 * (1 + 0.08 * rng.standard_normal())
+
+
+def spread_lengths(rng: np.random.Generator, path_length: float) -> float:
+    """A speed that spreads the episodes' lengths evenly over about 62 to 107 steps."""
+    return path_length / rng.uniform(62, 107)
+
+
+def demonstrate(
+    task: str, behaviors: Sequence[str], speed: SpeedRule, seed: int
+) -> Iterator[Demonstration]:
+    """One demonstration per entry of `behaviors`, in an order shuffled by the seed."""
+    rng = np.random.default_rng(seed)
+    layout = get_layout(task)
+    rule = MazeBehaviorRule(layout)
+    for behavior in rng.permutation(np.array(behaviors)):
+        while True:
+            path = forward_path(behavior, layout, rng)
+            path_length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+            demonstration = walk(path, speed(rng, path_length), task, rng)
+            # Hand tremor near a door's edge can, rarely, miss the door: such a recording is thrown away.
+            if rule(demonstration.observations) == behavior:
+                break
+        yield demonstration
+
+
+def _recipe(name: str, task: str, counts: dict[str, int], speed: SpeedRule) -> DatasetRecipe:
+    behaviors = [behavior for behavior, count in counts.items() for _ in range(count)]
+    return DatasetRecipe(
+        name=name,
+        instruction=INSTRUCTION,
+        fps=FPS,
+        robot_type="maze2d",
+        features={
+            "observation.state": ("x", "y"),
+            "observation.environment_state": ("goal_x", "goal_y"),
+            "action": ("dx", "dy"),
+        },
+        n_episodes=len(behaviors),
+        demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed),
+        behavior_rule=MazeBehaviorRule(get_layout(task)),
+    )
+
+
+# All 12 forward behaviours of the medium maze, unbalanced.
+ONLY_FORWARD = {
+    "6410": 16,
+    "7420": 14,
+    "6310": 12,
+    "7520": 11,
+    "6420": 10,
+    "7410": 8,
+    "6320": 7,
+    "7510": 6,
+    "7310": 5,
+    "6520": 4,
+    "7320": 4,
+    "6510": 3,
+}
+
+MAZE_RECIPES = (
+    _recipe("medium_maze-one_side", "medium", {"6410": 50, "7420": 50}, steady),
+    _recipe("medium_maze-only_forward", "medium", ONLY_FORWARD, steady),
+    _recipe(
+        "medium_maze-only_fast",
+        "medium",
+        {"6410": 25, "7420": 25, "6310": 25, "7520": 25},
+        spread_lengths,
+    ),
+)

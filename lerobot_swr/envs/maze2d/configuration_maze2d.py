@@ -1,0 +1,122 @@
+"""Maze2D as a LeRobot environment: ``--env.type=maze2d --env.task=small|medium|large``."""
+
+from dataclasses import dataclass, field
+
+import gymnasium as gym
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
+from lerobot_swr.envs.maze2d.env import FPS, MazeAgents, Maze2DVectorEnv
+from lerobot_swr.envs.maze2d.layouts import get_layout
+
+GYM_ID = "lerobot_swr/Maze2D-v0"
+
+if GYM_ID not in gym.registry:
+    gym.register(
+        id=GYM_ID,
+        entry_point="lerobot_swr.envs.maze2d.env:Maze2DEnv",
+        max_episode_steps=200,
+    )
+
+
+@EnvConfig.register_subclass("maze2d")
+@dataclass
+class Maze2DEnvConfig(TaskEnvConfig):
+    """Configuration of `lerobot_swr.envs.maze2d.env.Maze2DEnv`, which documents the task."""
+
+    task: str | None = "medium"
+    fps: int = FPS
+    # Step limit of an episode.
+    episode_length: int = 200
+
+    # Start: "fixed", "pseudo_random" (uniform square around the fixed start) or "random" (anywhere).
+    start: str = "fixed"
+    # Half the side of the pseudo-random start square, as a share of the maze's side.
+    start_radius: float = 0.10
+
+    # Standard deviation of the noise on every displacement, in units of the largest step (0.02 of the side).
+    transition_noise: float = 0.0
+    # Whether an agent that hits a wall stays where it was instead of sliding along.
+    sticky_walls: bool = False
+
+    # Side of the rendered picture, in pixels.
+    render_size: int = 320
+    render_mode: str = "rgb_array"
+
+    features: dict[str, PolicyFeature] = field(
+        default_factory=lambda: {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(2,)),
+            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
+        }
+    )
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Check every value now, before any environment or worker process is started.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        MazeAgents(**self._maze_options)
+        if self.episode_length < 1:
+            raise ValueError(f"episode_length={self.episode_length}: expected at least 1 step")
+
+    @property
+    def _maze_options(self) -> dict:
+        return {
+            "task": self.task,
+            "start": self.start,
+            "start_radius": self.start_radius,
+            "transition_noise": self.transition_noise,
+            "sticky_walls": self.sticky_walls,
+        }
+
+    @property
+    def gym_id(self) -> str:
+        """Gymnasium id of the environment."""
+        return GYM_ID
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """Arguments for `gymnasium.make`."""
+        return {
+            **self._maze_options,
+            "render_size": self.render_size,
+            "render_mode": self.render_mode,
+            "max_episode_steps": self.episode_length,
+        }
+
+    def behavior_rule(self) -> BehaviorRule:
+        """The checkpoints in the order in which they are first passed."""
+        return MazeBehaviorRule(get_layout(self.task or ""))
+
+    def draw_scene(self, axes: Axes) -> None:
+        """Walls, door numbers and the goal."""
+        layout = get_layout(self.task or "")
+        for wall in layout.walls:
+            edges = [0.0]
+            for door in sorted(wall.doors, key=lambda door: door.x):
+                edges += [door.x - door.half_width, door.x + door.half_width]
+                axes.text(door.x, wall.y, str(door.checkpoint), color="0.5", ha="center", va="center")
+            edges.append(1.0)
+            for left, right in zip(edges[::2], edges[1::2], strict=True):
+                axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")
+        axes.add_patch(Circle(layout.goal, layout.goal_radius, fill=False, color="tab:green", linewidth=2))
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+
+    def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
+        """All agents in one array."""
+        return Maze2DVectorEnv(n_envs, max_episode_steps=self.episode_length, **self._maze_options)

@@ -1,0 +1,225 @@
+"""Maze2D as a Gymnasium environment, for one agent and for a batch of agents."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal, move
+from lerobot_swr.envs.maze2d.layouts import get_layout
+from lerobot_swr.envs.maze2d.rendering import draw_episode, draw_maze
+
+STARTS = ("fixed", "pseudo_random", "random")
+FPS = 20
+INSTRUCTION = "Walk through the maze to the goal."
+
+
+class MazeAgents:
+    """Positions of n agents in one maze; the single implementation behind both environments.
+
+    Args are those of `Maze2DEnv`.
+    """
+
+    def __init__(
+        self, task: str, start: str, start_radius: float, transition_noise: float, sticky_walls: bool
+    ):
+        if start not in STARTS:
+            raise ValueError(f"start={start!r}: expected one of {', '.join(STARTS)}")
+        if not 0 <= start_radius <= 1:
+            raise ValueError(f"start_radius={start_radius}: expected a share of the maze's side, 0 to 1")
+        if not transition_noise >= 0:
+            raise ValueError(f"transition_noise={transition_noise}: expected a standard deviation >= 0")
+        self.layout = get_layout(task)
+        self.start, self.start_radius = start, start_radius
+        self.transition_noise, self.sticky_walls = transition_noise, sticky_walls
+
+    def draw_start(self, rng: np.random.Generator) -> np.ndarray:
+        """(2,) start position of one episode."""
+        start = np.array(self.layout.start)
+        if self.start == "fixed":
+            return start
+        if self.start == "random":
+            return rng.uniform(0.0, 1.0, size=2)
+        return rng.uniform(
+            np.maximum(start - self.start_radius, 0.0), np.minimum(start + self.start_radius, 1.0)
+        )
+
+    def step(
+        self, positions: np.ndarray, actions: np.ndarray, rngs: list[np.random.Generator]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Apply (n, 2) actions to (n, 2) positions; returns new positions and (n,) goal reached."""
+        displacements = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0) * MAX_STEP
+        if self.transition_noise > 0:
+            noise = np.stack([rng.standard_normal(2) for rng in rngs])
+            displacements = displacements + noise * (self.transition_noise * MAX_STEP)
+        positions = move(positions, displacements, self.layout, self.sticky_walls)
+        return positions, in_goal(positions, self.layout)
+
+    def observe(self, positions: np.ndarray) -> dict[str, np.ndarray]:
+        """Observations of (n, 2) positions, each (n, 2) float32."""
+        goals = np.broadcast_to(np.array(self.layout.goal, dtype=np.float32), positions.shape)
+        return {"agent_pos": positions.astype(np.float32), "environment_state": goals.copy()}
+
+    @staticmethod
+    def observation_space() -> spaces.Dict:
+        """Space of one agent's observation."""
+        unit_square = spaces.Box(0.0, 1.0, (2,), np.float32)
+        return spaces.Dict({"agent_pos": unit_square, "environment_state": unit_square})
+
+    @staticmethod
+    def action_space() -> spaces.Box:
+        """Space of one agent's action."""
+        return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+class Maze2DEnv(gym.Env):
+    """A point agent in a maze of horizontal walls with numbered doors.
+
+    **Observation** (dict of float32 arrays):
+
+    | key | shape | meaning | range |
+    |---|---|---|---|
+    | `agent_pos` | (2,) | x, y of the agent, as shares of the maze's side | 0 to 1 |
+    | `environment_state` | (2,) | x, y of the goal | 0 to 1 |
+
+    **Action** (2,) float32 in -1 to 1: displacement in x and y, in units of 0.02 of the side. Larger values are
+    clipped. Walls and the border stop the agent; by default it slides along them.
+
+    **Start**: `fixed` (the layout's start), `pseudo_random` (uniform in a square around it, cut at the border) or
+    `random` (uniform in the maze).
+
+    **Reward**: 1 when the goal is reached, else 0. **Termination**: goal reached. **Truncation**: by the
+    registered step limit (200).
+
+    **Behaviour**: the doors' numbers in the order in which they are first passed, ending in 0 at the goal
+    (`lerobot_swr.envs.maze2d.behavior`).
+
+    **Info**: `is_success` (bool).
+
+    Versions: v0, first release.
+
+    Args:
+        task: Layout: `small` (2 forward behaviours), `medium` (12) or `large` (24).
+        start: `fixed`, `pseudo_random` or `random`.
+        start_radius: Half the side of the pseudo-random start square, as a share of the maze's side.
+        transition_noise: Standard deviation of Gaussian noise on every displacement, in units of the largest step.
+        sticky_walls: An agent that hits a wall or the border does not move in that step.
+        render_size: Side of the rendered picture, in pixels.
+        render_mode: `rgb_array` or None.
+
+    Raises:
+        ValueError: For an unknown layout or start, or a radius or noise out of range.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: str = "medium",
+        start: str = "fixed",
+        start_radius: float = 0.10,
+        transition_noise: float = 0.0,
+        sticky_walls: bool = False,
+        render_size: int = 320,
+        render_mode: str | None = None,
+    ):
+        self.agents = MazeAgents(task, start, start_radius, transition_noise, sticky_walls)
+        self.task, self.task_description = task, INSTRUCTION
+        self.observation_space = self.agents.observation_space()
+        self.action_space = self.agents.action_space()
+        self.render_mode = render_mode
+        self._maze_picture = draw_maze(self.agents.layout, render_size) if render_mode else None
+        self._path: list[np.ndarray] = []
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode; `options` are ignored."""
+        super().reset(seed=seed)
+        self._path = [self.agents.draw_start(self.np_random)]
+        return self._observe(), {"is_success": False}
+
+    def step(
+        self, action: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+        """Apply a (2,) action."""
+        positions, reached = self.agents.step(
+            self._path[-1][None], np.asarray(action)[None], [self.np_random]
+        )
+        self._path.append(positions[0])
+        success = bool(reached[0])
+        return self._observe(), float(success), success, False, {"is_success": success}
+
+    def render(self) -> np.ndarray | None:
+        """(render_size, render_size, 3) uint8 picture of the maze and the path so far."""
+        if self._maze_picture is None:
+            return None
+        return draw_episode(self._maze_picture, np.stack(self._path))
+
+    def _observe(self) -> dict[str, np.ndarray]:
+        return {key: value[0] for key, value in self.agents.observe(self._path[-1][None]).items()}
+
+
+class Maze2DVectorEnv(gym.vector.VectorEnv):
+    """`Maze2DEnv` for n agents in one array; finished agents keep their last state until the next reset.
+
+    Args:
+        num_envs: Number of agents.
+        max_episode_steps: Step limit.
+        **maze_options: Those of `Maze2DEnv`, without `render_size` and `render_mode`.
+    """
+
+    metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
+
+    def __init__(self, num_envs: int, max_episode_steps: int = 200, **maze_options: Any):
+        self.task = maze_options.get("task", "medium")
+        self.task_description = INSTRUCTION
+        template = Maze2DEnv(**maze_options)
+        self.agents = template.agents
+        self.num_envs, self._max_episode_steps = num_envs, max_episode_steps
+        self.single_observation_space = template.observation_space
+        self.single_action_space = template.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._rngs = [np.random.default_rng() for _ in range(num_envs)]
+        self._positions = np.zeros((num_envs, 2))
+        self._terminated = np.zeros(num_envs, dtype=bool)
+        self._steps = 0
+
+    def reset(  # type: ignore[override]
+        self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Start an episode for every agent; `seed` as in Gymnasium's vector environments."""
+        if seed is not None:
+            seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
+            self._rngs = [gym.utils.seeding.np_random(s)[0] for s in seeds]
+        self._positions = np.stack([self.agents.draw_start(rng) for rng in self._rngs])
+        self._terminated = np.zeros(self.num_envs, dtype=bool)
+        self._steps = 0
+        return self.agents.observe(self._positions), {"is_success": self._terminated.copy()}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Apply (n, 2) actions to the agents that are still under way."""
+        moved, reached = self.agents.step(self._positions, actions, self._rngs)
+        under_way = ~self._terminated
+        self._positions = np.where(under_way[:, None], moved, self._positions)
+        reward = (reached & under_way).astype(np.float64)
+        self._terminated = self._terminated | (reached & under_way)
+        self._steps += 1
+        truncated = np.full(self.num_envs, self._steps >= self._max_episode_steps) & ~self._terminated
+        info = {"is_success": self._terminated.copy()}
+        return self.agents.observe(self._positions), reward, self._terminated.copy(), truncated, info
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """The attribute or method result `name`, once per agent, as Gymnasium's vector environments give it."""
+        value = getattr(self, name)
+        return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """The attribute `name`, once per agent."""
+        return self.call(name)

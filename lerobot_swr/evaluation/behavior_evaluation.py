@@ -1,0 +1,140 @@
+"""Behaviour evaluation: compares a policy's rollouts with the demonstrations."""
+
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from lerobot_swr.evaluation.metrics import (
+    Histogram,
+    Interval,
+    coverage,
+    histogram,
+    l1_distance,
+    l1_floor,
+    l1_interval,
+    style_fidelity,
+    success_entropy,
+    success_interval,
+)
+from lerobot_swr.evaluation.rollouts import Rollout
+
+
+@dataclass(frozen=True)
+class BehaviorResult:
+    """What ``behaviors.json`` holds.
+
+    Attributes:
+        style_sampling: How styles were drawn, ``uniform``, ``stratified`` or ``fixed``; None without styles.
+        n_episodes: Number of rollouts.
+        success_rate: Share of successes.
+        success_interval: Its Wilson 95 % interval.
+        l1: L1 distance of the two histograms, 0 to 2.
+        l1_interval: Its bootstrap 95 % interval over rollouts.
+        l1_floor: L1 that a perfect reproducer of the demonstrations would score on average.
+        l1_floor_band: The central 95 % of that.
+        coverage: Share of the demonstrated behaviours that were shown.
+        entropy: Of the successful rollouts' behaviours, in units of the log of their number in the dataset.
+        style_fidelity: Share of rollouts with the behaviour of the demonstration whose style was used.
+        histogram: Label to share of the rollouts.
+        reference_histogram: Label to share of the demonstrations.
+        episodes: One record per rollout.
+    """
+
+    style_sampling: str | None
+    n_episodes: int
+    success_rate: float
+    success_interval: Interval
+    l1: float
+    l1_interval: Interval
+    l1_floor: float
+    l1_floor_band: Interval
+    coverage: float
+    entropy: float
+    style_fidelity: float | None
+    histogram: Histogram
+    reference_histogram: Histogram
+    episodes: list[dict[str, Any]]
+
+
+def evaluate_behaviors(
+    rollouts: Sequence[Rollout],
+    demonstrated: Sequence[str],
+    style_sampling: str | None,
+    reference_episodes: Sequence[int] | None = None,
+) -> BehaviorResult:
+    """Compare rollouts with demonstrations.
+
+    Args:
+        rollouts: Episodes of the policy.
+        demonstrated: The label of every episode of the dataset.
+        style_sampling: How styles were drawn; None for a policy without styles.
+        reference_episodes: The episodes that make up the reference histogram; None takes all.
+    """
+    labels = [rollout.behavior for rollout in rollouts]
+    successes = [rollout.success for rollout in rollouts]
+    chosen = range(len(demonstrated)) if reference_episodes is None else reference_episodes
+    reference = [demonstrated[i] for i in chosen]
+    reference_histogram = histogram(reference)
+    floor = l1_floor(reference, len(rollouts), stratified=style_sampling in ("stratified", "fixed"))
+    requested = [demonstrated[r.style_episode] for r in rollouts if r.style_episode is not None]
+    return BehaviorResult(
+        style_sampling=style_sampling,
+        n_episodes=len(rollouts),
+        success_rate=sum(successes) / len(successes),
+        success_interval=success_interval(successes),
+        l1=l1_distance(histogram(labels), reference_histogram),
+        l1_interval=l1_interval([labels], reference_histogram),
+        l1_floor=floor.mean,
+        l1_floor_band=floor.band,
+        coverage=coverage(labels, reference_histogram),
+        entropy=success_entropy(labels, successes, len(reference_histogram)),
+        style_fidelity=style_fidelity(labels, requested) if requested else None,
+        histogram=histogram(labels),
+        reference_histogram=reference_histogram,
+        episodes=[
+            {
+                "behavior": rollout.behavior,
+                "success": rollout.success,
+                "length": rollout.length,
+                "style_episode": rollout.style_episode,
+            }
+            for rollout in rollouts
+        ],
+    )
+
+
+def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:
+    """Write a result dataclass and where it comes from, all or nothing."""
+    content = json.dumps({**asdict(result), "provenance": provenance}, indent=2)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
+        file.write(content + "\n")
+    os.replace(file.name, path)
+
+
+def format_result(result: BehaviorResult) -> str:
+    """A table for the terminal."""
+
+    def interval(value: Interval) -> str:
+        return f"[{value.low:.3f}, {value.high:.3f}]"
+
+    fidelity = "-" if result.style_fidelity is None else f"{result.style_fidelity:.3f}"
+    rows = [
+        ("rollouts", f"{result.n_episodes}", f"styles drawn: {result.style_sampling or 'none'}"),
+        ("success", f"{result.success_rate:.3f}", f"{interval(result.success_interval)} Wilson 95 %"),
+        ("L1", f"{result.l1:.3f}", f"{interval(result.l1_interval)} bootstrap 95 %"),
+        ("L1 floor", f"{result.l1_floor:.3f}", f"{interval(result.l1_floor_band)} perfect reproducer, 95 %"),
+        ("coverage", f"{result.coverage:.3f}", "share of demonstrated behaviours shown"),
+        ("entropy", f"{result.entropy:.3f}", "of successes, in log(number of demonstrated behaviours)"),
+        ("style fidelity", fidelity, "rollouts that show their style's demonstration's behaviour"),
+    ]
+    lines = [f"{name:<15} {value:>7}  {note}" for name, value, note in rows]
+    lines.append(f"{'behaviour':<24} {'demos':>6} {'rollouts':>8}")
+    for label in {**result.reference_histogram, **result.histogram}:
+        shares = result.reference_histogram.get(label, 0.0), result.histogram.get(label, 0.0)
+        lines.append(f"{label or '(none)':<24} {shares[0]:6.3f} {shares[1]:8.3f}")
+    return "\n".join(lines)

@@ -1,0 +1,133 @@
+"""Behaviour metrics: histograms, their L1 distance and its sampling floor, success, entropy, fidelity.
+
+Pure functions of labels; numbers only, no pictures.
+"""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+Histogram = dict[str, float]
+"""Label to share; the shares sum to 1."""
+
+FLOOR_DRAWS = 4000
+BOOTSTRAP_DRAWS = 2000
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A 95 % interval.
+
+    Attributes:
+        low: Lower end.
+        high: Upper end.
+    """
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Floor:
+    """What a perfect reproducer of the demonstrations would score.
+
+    Attributes:
+        mean: Expected L1.
+        band: The central 95 % of its L1.
+    """
+
+    mean: float
+    band: Interval
+
+
+def histogram(labels: Sequence[str]) -> Histogram:
+    """Share of each label, most frequent first.
+
+    Raises:
+        ValueError: If there are no labels.
+    """
+    if not labels:
+        raise ValueError("labels: a histogram needs at least one episode")
+    return {label: count / len(labels) for label, count in Counter(labels).most_common()}
+
+
+def l1_distance(p: Mapping[str, float], q: Mapping[str, float]) -> float:
+    """Σ |p − q| over all labels of either histogram, missing labels counting 0: 0 (equal) to 2 (disjoint)."""
+    return float(sum(abs(p.get(label, 0.0) - q.get(label, 0.0)) for label in p.keys() | q.keys()))
+
+
+def l1_floor(reference: Sequence[str], n_episodes: int, stratified: bool = False, seed: int = 0) -> Floor:
+    """L1 of a perfect reproducer that shows the behaviour of a drawn demonstration in every rollout.
+
+    Source: simulation of the two ways of drawing demonstrations; the uniform one is a multinomial sample of
+    the reference histogram.
+
+    Args:
+        reference: One label per demonstration.
+        n_episodes: Number of rollouts.
+        stratified: Draw every demonstration once before any is drawn again; otherwise with replacement.
+        seed: Seed of the simulation.
+    """
+    counts = np.array(list(Counter(reference).values()))
+    share = counts / counts.sum()
+    rng = np.random.default_rng(seed)
+    if stratified:
+        rounds, rest = divmod(n_episodes, int(counts.sum()))
+        drawn = rounds * counts + rng.multivariate_hypergeometric(counts, rest, size=FLOOR_DRAWS)
+    else:
+        drawn = rng.multinomial(n_episodes, share, size=FLOOR_DRAWS)  # (draws, labels)
+    distances = np.abs(drawn / n_episodes - share).sum(axis=1)
+    return Floor(float(distances.mean()), Interval(*np.quantile(distances, [0.025, 0.975]).tolist()))
+
+
+def l1_interval(labels_by_seed: Sequence[Sequence[str]], reference: Mapping[str, float]) -> Interval:
+    """Bootstrap interval of L1 over training seeds and, within a seed, over rollouts.
+
+    Resampled histograms are noisier than the observed one, so the interval leans upwards near L1 = 0.
+
+    Args:
+        labels_by_seed: For each training seed the labels of its rollouts.
+        reference: Histogram of the demonstrations.
+    """
+    rng = np.random.default_rng(0)
+    names = sorted({label for labels in labels_by_seed for label in labels} | set(reference))
+    place = {label: i for i, label in enumerate(names)}
+    reference_shares = np.array([reference.get(label, 0.0) for label in names])
+    shares = [np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed]
+    scores = []
+    for _ in range(BOOTSTRAP_DRAWS):
+        chosen = rng.integers(len(shares), size=len(shares))
+        resampled = [rng.multinomial(c.sum(), c / c.sum()) / c.sum() for c in (shares[i] for i in chosen)]
+        scores.append(np.mean([np.abs(r - reference_shares).sum() for r in resampled]))
+    return Interval(*np.quantile(scores, [0.025, 0.975]).tolist())
+
+
+def success_interval(successes: Sequence[bool]) -> Interval:
+    """Wilson's 95 % interval of a success rate."""
+    interval = stats.binomtest(int(sum(successes)), len(successes)).proportion_ci(method="wilson")
+    return Interval(float(interval.low), float(interval.high))
+
+
+def success_entropy(labels: Sequence[str], successes: Sequence[bool], n_behaviors: int) -> float:
+    """Entropy of the behaviours of successful rollouts, in units of log `n_behaviors`.
+
+    D3IL's convention for Avoiding (Jia et al., ICLR 2024): failures are left out and the base of the logarithm
+    is the number of behaviours in the demonstrations; 1 is uniform, 0 a single behaviour or no success.
+    """
+    counts = np.array(list(Counter(la for la, ok in zip(labels, successes, strict=True) if ok).values()))
+    if len(counts) == 0 or n_behaviors < 2:
+        return 0.0
+    return float(stats.entropy(counts) / np.log(n_behaviors))
+
+
+def coverage(labels: Sequence[str], reference: Mapping[str, float]) -> float:
+    """Share of the demonstrated behaviours that appear at least once."""
+    return len(set(labels) & set(reference)) / len(reference)
+
+
+def style_fidelity(labels: Sequence[str], requested: Sequence[str]) -> float:
+    """Share of rollouts that show the behaviour of the demonstration whose style they used."""
+    return float(np.mean([shown == wanted for shown, wanted in zip(labels, requested, strict=True)]))

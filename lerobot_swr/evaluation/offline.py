@@ -1,0 +1,163 @@
+"""Offline evaluation: action errors on a dataset's frames, where there is no simulator."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
+from lerobot_swr.policies.modeling_swr import BCPolicy, ZBCPolicy
+from lerobot_swr.similarity import pairwise_distances
+from lerobot_swr.trajectories import Trajectories
+
+BATCH = 4096
+KINDS = {
+    "own": "own style",
+    "nearest": "style of the nearest other demonstration",
+    "random": "style of a random other demonstration",
+    "none": "no style",
+}
+
+
+@dataclass(frozen=True)
+class OfflineResult:
+    """What ``offline.json`` holds.
+
+    Attributes:
+        n_episodes: Episodes evaluated: those that were trained on, for a style policy.
+        n_frames: Their frames.
+        action_error: Kind of style (``own``, ``nearest``, ``random``, or ``none`` for a policy without styles) to
+            the mean over frames of the squared error of the normalised action, itself a mean over dimensions.
+        action_error_interval: Its bootstrap 95 % interval over episodes.
+        action_error_by_dimension: The same mean for each action dimension, in order.
+    """
+
+    n_episodes: int
+    n_frames: int
+    action_error: dict[str, float]
+    action_error_interval: dict[str, Interval]
+    action_error_by_dimension: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class FrameErrors:
+    """Squared errors of every evaluated frame.
+
+    Attributes:
+        episodes: (F,) episode of each frame.
+        phase: (F,) place of each frame in its episode, 0 to 1.
+        squared: Kind of style to (F, A) squared errors in normalised units.
+    """
+
+    episodes: np.ndarray
+    phase: np.ndarray
+    squared: dict[str, np.ndarray]
+
+
+def frame_errors(
+    checkpoint: Checkpoint, trajectories: Trajectories, episodes: list[int] | None = None, seed: int = 0
+) -> FrameErrors:
+    """Predict every frame's action with each kind of style.
+
+    Args:
+        checkpoint: A ``bc``, ``zbc`` or ``wzbc`` policy.
+        trajectories: The dataset it was trained on.
+        episodes: Only these; None takes all (of those trained on, for a style policy).
+        seed: Seed of the random styles, one draw per frame.
+
+    Raises:
+        ValueError: For another type of policy, or when fewer than 2 episodes have a style.
+    """
+    policy = checkpoint.policy
+    if not isinstance(policy, BCPolicy):
+        raise ValueError(
+            f"policy.type={policy.config.type!r}: offline evaluation knows bc, zbc and wzbc; "
+            "evaluate this policy in an environment (--env.type=...)"
+        )
+    chosen = np.arange(len(trajectories)) if episodes is None else np.array(episodes)
+    styles: dict[str, np.ndarray | None] = {"none": None}
+    if isinstance(policy, ZBCPolicy):
+        trained = policy.styles.trained.bool().cpu().numpy()
+        chosen = chosen[trained[chosen]]
+        if trained.sum() < 2 or len(chosen) == 0:
+            raise ValueError("offline evaluation compares styles: at least 2 trained episodes are needed")
+    frames = np.concatenate(
+        [trajectories.starts[i] + np.arange(trajectories.lengths[i]) for i in chosen]
+    )  # (F,) rows
+    episode_of_frame = np.repeat(chosen, trajectories.lengths[chosen])
+    if isinstance(policy, ZBCPolicy):
+        styles = _styles_of_frames(policy, trajectories, np.flatnonzero(trained), episode_of_frame, seed)
+    squared = {kind: _squared_errors(checkpoint, trajectories, frames, used) for kind, used in styles.items()}
+    place = frames - trajectories.starts[episode_of_frame]
+    phase = place / np.maximum(trajectories.lengths[episode_of_frame] - 1, 1)
+    return FrameErrors(episode_of_frame, phase, squared)
+
+
+def _styles_of_frames(
+    policy: ZBCPolicy, trajectories: Trajectories, trained: np.ndarray, own: np.ndarray, seed: int
+) -> dict[str, np.ndarray | None]:
+    """Kind of style to the (F,) episodes whose styles the frames use."""
+    distances = pairwise_distances(trajectories.states(policy.config.observation_keys))
+    np.fill_diagonal(distances, np.inf)
+    nearest = trained[distances[:, trained].argmin(axis=1)]  # (N,)
+    place = np.searchsorted(trained, own)
+    shift = np.random.default_rng(seed).integers(1, len(trained), size=len(own))
+    return {"own": own, "nearest": nearest[own], "random": trained[(place + shift) % len(trained)]}
+
+
+@torch.no_grad()
+def _squared_errors(
+    checkpoint: Checkpoint, trajectories: Trajectories, frames: np.ndarray, styles: np.ndarray | None
+) -> np.ndarray:
+    policy = checkpoint.policy
+    assert isinstance(policy, BCPolicy)
+    parts = []
+    for start in range(0, len(frames), BATCH):
+        rows = frames[start : start + BATCH]
+        raw: dict[str, Tensor] = {
+            key: torch.from_numpy(trajectories.columns[key][rows])
+            for key in [*policy.config.observation_keys, ACTION]
+        }
+        batch = checkpoint.preprocessor(raw)
+        style = None
+        if styles is not None:
+            assert isinstance(policy, ZBCPolicy)
+            used = torch.from_numpy(styles[start : start + BATCH]).to(batch[OBS_STATE].device)
+            style = policy.styles.embedding(used)
+        parts.append((policy.network(batch, style) - batch[ACTION]).square().cpu().numpy())
+    return np.concatenate(parts)
+
+
+def summarize(errors: FrameErrors) -> OfflineResult:
+    """Means and their bootstrap intervals over episodes."""
+    names, place = np.unique(errors.episodes, return_inverse=True)
+    count = np.bincount(place)  # (E,) frames per episode
+    draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAP_DRAWS, len(names)))
+    intervals = {}
+    for kind, squared in errors.squared.items():
+        total = np.bincount(place, weights=squared.mean(axis=1))
+        resampled = total[draws].sum(axis=1) / count[draws].sum(axis=1)
+        intervals[kind] = Interval(*np.quantile(resampled, [0.025, 0.975]).tolist())
+    return OfflineResult(
+        n_episodes=len(names),
+        n_frames=len(place),
+        action_error={kind: float(squared.mean()) for kind, squared in errors.squared.items()},
+        action_error_interval=intervals,
+        action_error_by_dimension={
+            kind: squared.mean(axis=0).tolist() for kind, squared in errors.squared.items()
+        },
+    )
+
+
+def format_offline(result: OfflineResult) -> str:
+    """A table for the terminal."""
+    lines = [
+        f"{result.n_frames} frames of {result.n_episodes} episodes; mean squared action error, normalised units"
+    ]
+    for kind, error in result.action_error.items():
+        interval = result.action_error_interval[kind]
+        lines.append(f"  {KINDS[kind]:<42} {error:.5f}  [{interval.low:.5f}, {interval.high:.5f}]")
+    return "\n".join(lines)

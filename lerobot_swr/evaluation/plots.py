@@ -1,0 +1,118 @@
+"""Pictures of behaviour and offline evaluations, drawn from their results."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from lerobot.envs import EnvConfig
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.evaluation.metrics import Histogram
+
+MAX_BARS = 24
+DEMONSTRATIONS, ROLLOUTS = "0.6", "tab:blue"
+
+Paths = Sequence[tuple[np.ndarray, str]]
+"""Paths (T, 2) and their behaviour labels."""
+
+
+def behavior_colors(labels: Sequence[str]) -> dict[str, tuple[float, ...]]:
+    """One colour per label."""
+    palette = [*colormaps["tab20"].colors[::2], *colormaps["tab20"].colors[1::2]]  # type: ignore[attr-defined]
+    return {label: palette[i % len(palette)] for i, label in enumerate(dict.fromkeys(labels))}
+
+
+def plot_behaviors(
+    path: Path,
+    demonstrations: Paths,
+    rollouts: Paths,
+    reference: Histogram,
+    shown: Histogram,
+    env_cfg: EnvConfig,
+    title: str,
+) -> None:
+    """Trajectories of demonstrations and rollouts, coloured by behaviour, and both histograms.
+
+    Args:
+        path: Where to write the picture (the suffix tells the format).
+        demonstrations: Paths of the demonstrations.
+        rollouts: Paths of the rollouts.
+        reference: Histogram of the demonstrations.
+        shown: Histogram of the rollouts.
+        env_cfg: Draws the scene, if it is one of this package's tasks.
+        title: Heading.
+    """
+    figure = Figure(figsize=(13, 4.4), layout="constrained")
+    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.35))
+    colors = behavior_colors([*reference, *shown])
+    for axes, paths, name in ((left, demonstrations, "demonstrations"), (middle, rollouts, "rollouts")):
+        draw_paths(axes, paths, colors, env_cfg)
+        axes.set_title(f"{len(paths)} {name}")
+    draw_histograms(right, reference, shown)
+    figure.suptitle(title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
+def draw_paths(
+    axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig
+) -> None:
+    """Paths in the scene, coloured by behaviour."""
+    if isinstance(env_cfg, TaskEnvConfig):
+        env_cfg.draw_scene(axes)
+    for points, label in paths:
+        axes.plot(*points.T, color=colors[label], linewidth=0.8, alpha=0.8)
+    axes.set_aspect("equal")
+    axes.set(xticks=[], yticks=[])
+
+
+def draw_histograms(axes: Axes, reference: Histogram, shown: Histogram) -> None:
+    """Shares of the behaviours of demonstrations and rollouts side by side, most demonstrated first."""
+    labels = list({**reference, **shown})
+    kept, others = labels[:MAX_BARS], labels[MAX_BARS:]
+    rows: list[tuple[str, float, float]] = [
+        (label or "(none)", reference.get(label, 0.0), shown.get(label, 0.0)) for label in kept
+    ]
+    if others:
+        rest = [sum(source.get(label, 0.0) for label in others) for source in (reference, shown)]
+        rows.append((f"{len(others)} others", rest[0], rest[1]))
+    place = np.arange(len(rows))
+    axes.bar(place - 0.2, [row[1] for row in rows], 0.4, label="demonstrations", color=DEMONSTRATIONS)
+    axes.bar(place + 0.2, [row[2] for row in rows], 0.4, label="rollouts", color=ROLLOUTS)
+    axes.set_xticks(place, [row[0] for row in rows], rotation=90 if len(rows) > 6 else 0)
+    axes.set(xlabel="behaviour", ylabel="share of episodes")
+    axes.legend()
+
+
+def plot_offline(
+    path: Path, errors: Mapping[str, np.ndarray], phase: np.ndarray, describe: Callable[[str], str], title: str
+) -> None:
+    """Action error by kind of style: over all frames, and along the episode.
+
+    Args:
+        path: Where to write the picture.
+        errors: Kind of style to (F,) squared error of each frame, in normalised units.
+        phase: (F,) place of each frame in its episode, 0 to 1.
+        describe: Legend of a kind of style.
+        title: Heading.
+    """
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    bars, along = figure.subplots(1, 2, width_ratios=(1, 1.6))
+    colors = {kind: f"C{i}" for i, kind in enumerate(errors)}
+    means = [values.mean() for values in errors.values()]
+    drawn = bars.bar(list(errors), means, color=list(colors.values()))
+    bars.bar_label(drawn, fmt="%.3g")
+    bars.set(ylabel="mean squared action error\n(normalised units)", xlabel="style")
+    bins = np.minimum((phase * 20).astype(int), 19)
+    for kind, values in errors.items():
+        mean = [values[bins == b].mean() if (bins == b).any() else np.nan for b in range(20)]
+        along.plot((np.arange(20) + 0.5) / 20, mean, color=colors[kind])
+    along.set(xlabel="share of the episode", ylabel="mean squared action error", yscale="log")
+    along.legend([Line2D([], [], color=colors[kind]) for kind in errors], [describe(kind) for kind in errors])
+    figure.suptitle(title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

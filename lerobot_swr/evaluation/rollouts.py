@@ -1,0 +1,139 @@
+"""Rollouts of any LeRobot policy, with the states that behaviour rules need."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from lerobot.envs import EnvConfig, make_env, make_env_pre_post_processors, preprocess_observation
+from lerobot.scripts.lerobot_eval import rollout
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.evaluation.checkpoint import Checkpoint
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One episode of a policy in an environment.
+
+    Attributes:
+        observations: LeRobot feature name to (T + 1, d), the last state included.
+        behavior: Label that the rule gave.
+        success: Whether the environment called it a success.
+        length: T, number of actions.
+        style_episode: The demonstration whose style was used; None for a policy without styles.
+    """
+
+    observations: dict[str, np.ndarray]
+    behavior: str
+    success: bool
+    length: int
+    style_episode: int | None
+
+
+class StateRecorder(gym.vector.VectorWrapper):
+    """Keeps every sub-environment's low-dimensional observations up to the end of its first episode."""
+
+    def reset(self, **kwargs: Any) -> tuple[dict, dict]:  # type: ignore[override]
+        """Reset all sub-environments and start recording."""
+        observations, info = self.env.reset(**kwargs)
+        self._done = np.zeros(self.num_envs, dtype=bool)
+        self._recorded: list[list[dict[str, np.ndarray]]] = [[row] for row in self._rows(observations)]
+        return observations, info
+
+    def step(self, actions: np.ndarray) -> tuple[dict, np.ndarray, np.ndarray, np.ndarray, dict]:  # type: ignore[override]
+        """Step all sub-environments and record those that are under way."""
+        observations, reward, terminated, truncated, info = self.env.step(actions)
+        final_observations = info.get("final_obs")
+        for i, row in enumerate(self._rows(observations)):
+            if self._done[i]:
+                continue
+            if final_observations is not None and final_observations[i] is not None:
+                row = _low_dimensional(final_observations[i])  # the row itself is the next episode's already
+            self._recorded[i].append(row)
+        self._done |= terminated | truncated
+        return observations, reward, terminated, truncated, info
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
+        """Ask every sub-environment, as LeRobot's rollout does."""
+        return self.env.call(name, *args, **kwargs)  # type: ignore[attr-defined]
+
+    def get_attr(self, name: str) -> tuple[Any, ...]:
+        """An attribute of every sub-environment."""
+        return self.env.get_attr(name)  # type: ignore[attr-defined]
+
+    def episodes(self) -> list[dict[str, np.ndarray]]:
+        """Observations of each sub-environment's first episode, by LeRobot's feature names, (T + 1, d)."""
+        stacked = [{key: np.stack([row[key] for row in rows]) for key in rows[0]} for rows in self._recorded]
+        return [{k: v.numpy() for k, v in preprocess_observation(episode).items()} for episode in stacked]
+
+    def _rows(self, observations: dict) -> list[dict[str, np.ndarray]]:
+        low_dimensional = _low_dimensional(observations)
+        return [{key: value[i] for key, value in low_dimensional.items()} for i in range(self.num_envs)]
+
+
+def _low_dimensional(observations: dict) -> dict[str, np.ndarray]:
+    return {k: np.array(v) for k, v in observations.items() if k != "pixels" and isinstance(v, np.ndarray)}
+
+
+def make_rollout_env(env_cfg: EnvConfig, n_envs: int) -> gym.vector.VectorEnv:
+    """A vector environment in this process.
+
+    Raises:
+        ValueError: If the environment has several tasks.
+    """
+    if isinstance(env_cfg, TaskEnvConfig):
+        return env_cfg.create_rollout_env(n_envs)
+    suites = make_env(env_cfg, n_envs=n_envs, use_async_envs=False)
+    envs = [env for tasks in suites.values() for env in tasks.values()]
+    if len(envs) != 1:
+        raise ValueError(f"env.type={env_cfg.type!r}: {len(envs)} tasks; choose one with --env.task")
+    return envs[0]
+
+
+def run_rollouts(
+    checkpoint: Checkpoint,
+    env_cfg: EnvConfig,
+    rule: BehaviorRule,
+    n_episodes: int,
+    batch_size: int,
+    seed: int,
+) -> list[Rollout]:
+    """Roll a policy out and label its behaviours.
+
+    Args:
+        checkpoint: The policy.
+        env_cfg: The environment.
+        rule: Labels an episode from its observations.
+        n_episodes: Number of episodes.
+        batch_size: Largest number of environments that run at once.
+        seed: Seeds torch once and environment k with ``seed + k``.
+    """
+    set_seed(seed)
+    env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg, checkpoint.policy.config)
+    rollouts: list[Rollout] = []
+    while len(rollouts) < n_episodes:
+        size = min(batch_size, n_episodes - len(rollouts))
+        env = StateRecorder(make_rollout_env(env_cfg, size))
+        try:
+            outcome = rollout(
+                env,
+                checkpoint.policy,
+                env_preprocessor,
+                env_postprocessor,
+                checkpoint.preprocessor,
+                checkpoint.postprocessor,
+                seeds=[seed + len(rollouts) + i for i in range(size)],
+            )
+            episodes = env.episodes()
+        finally:
+            env.close()
+        styles = checkpoint.policy.styles.active.tolist() if checkpoint.has_styles else [None] * size
+        for i, observations in enumerate(episodes):
+            length = int(outcome["done"][i].int().argmax()) + 1
+            states = {key: value[: length + 1] for key, value in observations.items()}
+            success = bool(outcome["success"][i, :length].any())
+            rollouts.append(Rollout(states, rule(states), success, length, styles[i]))
+    return rollouts

@@ -1,0 +1,196 @@
+"""Configurations of the policies ``bc``, ``zbc`` and ``wzbc``.
+
+The method is that of *Offline Learning of Controllable Diverse Behaviors* (Petitbois, Portelas, Lamprier,
+Denoyer; arXiv 2504.18160), "the paper". Defaults are the paper's values, except where a comment says otherwise;
+`docs/method.md` gives the reasons and the flags of the paper's literal network.
+"""
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig, OptimizerConfig
+from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
+from lerobot.utils.constants import OBS_STATE
+
+from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
+from lerobot_swr.sampling import check_partner_sampling, check_probability
+from lerobot_swr.similarity import check_beta, check_normalization
+from lerobot_swr.styles import check_style_sampling
+
+
+@PreTrainedConfig.register_subclass("bc")
+@dataclass
+class BCConfig(PreTrainedConfig):
+    """Behaviour cloning with a deterministic policy: the baseline without styles.
+
+    Args of `PreTrainedConfig` apply; every other field is documented where it is defined.
+    """
+
+    # --- Network ---
+    # Width of the hidden layers.
+    hidden_dim: int = 128
+    # Number of hidden layers.
+    num_hidden: int = 10
+    # Add each hidden layer's input to its output. Deviates from the paper's plain network, which trains
+    # unreliably at this depth.
+    residual: bool = True
+
+    # --- Training ---
+    # Adam's learning rate.
+    optimizer_lr: float = 1e-3
+    optimizer_betas: tuple[float, float] = (0.9, 0.999)
+    optimizer_weight_decay: float = 0.0
+    optimizer_grad_clip_norm: float = 10.0
+    # "cosine" (to 0 at the run's last step, whatever --steps is) or "constant" (the paper).
+    lr_schedule: str = "cosine"
+    # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
+    # uniformly, which favours long episodes).
+    balance_episodes: bool = True
+    # Treat numbers below 1e-38 as 0 in this process; they make the CPU several times slower.
+    flush_denormal: bool = True
+
+    # --- Normalization ---
+    normalization_mapping: dict[str, NormalizationMode] = field(
+        default_factory=lambda: {
+            "STATE": NormalizationMode.MEAN_STD,
+            "ENV": NormalizationMode.MEAN_STD,
+            "ACTION": NormalizationMode.MEAN_STD,
+        }
+    )
+
+    # --- Set from the dataset; not meant to be given ---
+    # Number of episodes of the training dataset.
+    num_episodes: int | None = None
+    # Hash of the training dataset's states; tells resuming from fine-tuning on other data.
+    dataset_fingerprint: str | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        super().__post_init__()
+        for key in ("hidden_dim", "num_hidden"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+        if not self.optimizer_lr > 0:
+            raise ValueError(f"optimizer_lr={self.optimizer_lr}: expected a number > 0")
+        if self.lr_schedule not in ("cosine", "constant"):
+            raise ValueError(f"lr_schedule={self.lr_schedule!r}: expected 'cosine' or 'constant'")
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """Only the current observation is used."""
+        return None
+
+    @property
+    def action_delta_indices(self) -> None:
+        """Only the current action is predicted."""
+        return None
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """Rewards are not used."""
+        return None
+
+    @property
+    def observation_keys(self) -> list[str]:
+        """Names of the low-dimensional observations, in the order in which the network sees them."""
+        inputs = self.input_features or {}
+        return [key for key, ft in inputs.items() if ft.type in (FeatureType.STATE, FeatureType.ENV)]
+
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        """Fused Adam."""
+        return FusedAdamConfig(
+            lr=self.optimizer_lr,
+            betas=self.optimizer_betas,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """The learning rate's schedule; it ends with the run."""
+        if self.lr_schedule == "constant":
+            return None
+        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=0)
+
+    def validate_features(self) -> None:
+        """Check that the dataset has what the policy needs.
+
+        Raises:
+            ValueError: If it has no ``observation.state`` or no ``action``.
+        """
+        if self.robot_state_feature is None:
+            raise ValueError(
+                f"policy {self.type!r} needs the feature {OBS_STATE!r}; the dataset has: "
+                f"{', '.join(self.input_features or {})} (rename a feature with --rename_map)"
+            )
+        if self.action_feature is None:
+            raise ValueError(f"policy {self.type!r} needs the feature 'action'; the dataset has none")
+
+
+@PreTrainedConfig.register_subclass("zbc")
+@dataclass
+class ZBCConfig(BCConfig):
+    """Style-conditioned behaviour cloning: one trainable style per demonstration (the paper's eq. 1 and 2)."""
+
+    # --- Styles ---
+    # Dimension of a style z.
+    style_dim: int = 10
+    # Standard deviation of the styles' normal initialisation. The paper's code leaves PyTorch's 1.0, which
+    # needs several times more steps.
+    style_init_scale: float = 0.1
+
+    # --- Inference: which styles are drawn, one per episode of the environment ---
+    # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again) or
+    # "fixed" (in the given order).
+    style_sampling: str = "uniform"
+    # Only the styles of these episodes of the training dataset; null allows all that were trained.
+    style_episodes: list[int] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        super().__post_init__()
+        if self.style_dim < 1:
+            raise ValueError(f"style_dim={self.style_dim}: expected at least 1")
+        if not self.style_init_scale >= 0:
+            raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
+        check_style_sampling(self.style_sampling)
+
+
+@PreTrainedConfig.register_subclass("wzbc")
+@dataclass
+class WZBCConfig(ZBCConfig):
+    """ZBC with similarity weighted regression: similar demonstrations teach each other's styles (algorithm 1)."""
+
+    # --- Similarity weighted regression ---
+    # Inverse temperature of the weights exp(-beta * nu): 0 lets every demonstration teach every style, large
+    # values only (near-)equal ones.
+    beta: float = 10.0
+    # Probability of relabelling a frame with another demonstration's style; 0 is ZBC.
+    p: float = 0.8
+    # Draw partners uniformly and weight the loss ("uniform", the paper), or draw them by weight ("weighted",
+    # same expectation, less variance).
+    partner_sampling: str = "uniform"
+    # Divide distances by the farthest episode of each demonstration ("row", the paper) or of all ("global").
+    similarity_normalization: str = "row"
+    # Features, in their own units, over which demonstrations are compared; null takes all observations that
+    # the network sees.
+    similarity_keys: list[str] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        super().__post_init__()
+        check_beta(self.beta)
+        check_probability(self.p)
+        check_partner_sampling(self.partner_sampling)
+        check_normalization(self.similarity_normalization)

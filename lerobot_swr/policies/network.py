@@ -1,0 +1,86 @@
+"""The network: observation encoder, style, trunk and action head, each replaceable on its own."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class ObservationEncoder(nn.Module):
+    """Low-dimensional observations side by side.
+
+    Args:
+        keys: Names of the observations, in order.
+    """
+
+    def __init__(self, keys: Sequence[str]):
+        super().__init__()
+        self.keys = tuple(keys)
+
+    def forward(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B, d) features of a batch of observations (B, d_k)."""
+        return torch.cat([batch[key] for key in self.keys], dim=-1)
+
+
+class Trunk(nn.Module):
+    """A deep ReLU network on features and, for style policies, a style.
+
+    Args:
+        in_dim: Dimension of features and style together.
+        hidden_dim: Width of every hidden layer.
+        num_hidden: Number of hidden layers.
+        residual: Add each hidden layer's input to its output (from the second layer on).
+    """
+
+    def __init__(self, in_dim: int, hidden_dim: int, num_hidden: int, residual: bool):
+        super().__init__()
+        dims = [in_dim] + [hidden_dim] * num_hidden
+        self.layers = nn.ModuleList(
+            nn.Linear(before, after) for before, after in zip(dims[:-1], dims[1:], strict=True)
+        )
+        self.residual = residual
+
+    def forward(self, features: Tensor) -> Tensor:
+        """(B, hidden_dim) of (B, in_dim)."""
+        first, *others = self.layers
+        hidden = torch.relu(first(features))
+        for layer in others:
+            update = torch.relu(layer(hidden))
+            hidden = hidden + update if self.residual else update
+        return hidden
+
+
+class ActionNetwork(nn.Module):
+    """π_θ(a | s, z): the mean of a Gaussian of fixed variance, i.e. a deterministic policy.
+
+    Args:
+        observation_keys: Names of the observations.
+        observation_dim: Their dimensions together.
+        style_dim: Dimension of z; 0 for a policy without styles.
+        action_dim: Dimension of the action.
+        hidden_dim: Width of every hidden layer.
+        num_hidden: Number of hidden layers.
+        residual: Whether hidden layers are residual.
+    """
+
+    def __init__(
+        self,
+        observation_keys: Sequence[str],
+        observation_dim: int,
+        style_dim: int,
+        action_dim: int,
+        hidden_dim: int,
+        num_hidden: int,
+        residual: bool,
+    ):
+        super().__init__()
+        self.encoder = ObservationEncoder(observation_keys)
+        self.trunk = Trunk(observation_dim + style_dim, hidden_dim, num_hidden, residual)
+        self.head = nn.Linear(hidden_dim, action_dim)
+
+    def forward(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, d_k) and styles (B, style_dim)."""
+        features = self.encoder(batch)
+        if style is not None:
+            features = torch.cat([features, style], dim=-1)
+        return self.head(self.trunk(features))

@@ -1,0 +1,145 @@
+"""The similarity-weighted sampler: draws which demonstration's style a frame is relabelled with (algorithm 1)."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lerobot_swr.similarity import Normalization, check_beta, check_normalization
+
+PartnerSampling = Literal["uniform", "weighted"]
+
+MAX_INSPECTED_STYLES = 64
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Which style each frame of a batch teaches, and how much.
+
+    Attributes:
+        styles: (B,) int64, episode j whose style is used; j = i where the frame is not relabelled.
+        weights: (B,) weight of the frame's loss: W(τ_i, τ_j), or 1 where it is not relabelled.
+        relabelled: (B,) bool, True where j ≠ i: no gradient may flow into z_j there.
+    """
+
+    styles: Tensor
+    weights: Tensor
+    relabelled: Tensor
+
+
+class SimilarityWeightedSampler:
+    """Draws pairs (i, j) for given episodes i, with j ≠ i at probability p.
+
+    ``uniform`` draws j uniformly and weights the loss by W(τ_i, τ_j), as the paper does; ``weighted`` draws
+    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and a lower variance. Draws come
+    from torch's global generator, which LeRobot saves and restores with a checkpoint.
+
+    Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`. The
+    normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
+
+    Args:
+        distances: (N, N) distances of the episodes.
+        beta: Inverse temperature of the weights, >= 0.
+        p: Probability of relabelling a frame.
+        normalization: How distances become dissimilarities, ``row`` or ``global``.
+        partner_sampling: ``uniform`` or ``weighted``.
+
+    Raises:
+        ValueError: For a value out of range.
+    """
+
+    def __init__(
+        self,
+        distances: np.ndarray,
+        beta: float,
+        p: float,
+        normalization: Normalization = "row",
+        partner_sampling: PartnerSampling = "uniform",
+    ):
+        check_beta(beta)
+        check_probability(p)
+        check_partner_sampling(partner_sampling)
+        check_normalization(normalization)
+        self.beta, self.p = beta, p
+        self.normalization, self.partner_sampling = normalization, partner_sampling
+        self._distances = torch.from_numpy(distances).to(torch.float32)  # (N, N)
+        self.candidates = torch.zeros(len(distances), dtype=torch.bool)
+        self._largest = torch.zeros(len(distances))  # (N,) largest distance to a candidate
+        self.effective_demos = 0.0
+
+    def set_candidates(self, candidates: Tensor) -> None:
+        """Restrict the draw to the episodes marked in `candidates`, (N,), non-zero where marked."""
+        marked = candidates.bool()
+        if torch.equal(marked, self.candidates):
+            return
+        self._distances = self._distances.to(marked.device)
+        self.candidates = marked.clone()
+        self._candidate_list = marked.nonzero().squeeze(1)  # (M,)
+        self._place = marked.long().cumsum(0) - 1  # (N,) place of a candidate in that list
+        among = self._distances[:, self._candidate_list]  # (N, M)
+        self._largest = among.amax(dim=1)
+        if self.normalization == "global":
+            self._largest = self._largest[self._candidate_list].amax().expand(len(marked))
+        self.effective_demos = self._effective_demos()
+
+    def nu(self, i: Tensor, j: Tensor) -> Tensor:
+        """ν(τ_i, τ_j) of pairs of episodes, (B,) each or broadcastable to each other."""
+        largest = self._largest[i]
+        return torch.where(largest > 0, self._distances[i, j] / largest, 0.0)
+
+    def draw(self, episodes: Tensor) -> Pairs:
+        """Draw a partner for every frame.
+
+        Args:
+            episodes: (B,) int64, episode i of each frame; all of them candidates.
+        """
+        others = len(self._candidate_list) - 1
+        if self.p == 0 or others < 1:
+            ones = torch.ones(len(episodes), device=episodes.device)
+            return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
+        relabelled = torch.rand(len(episodes), device=episodes.device) < self.p
+        if self.partner_sampling == "uniform":
+            place = torch.randint(others, episodes.shape, device=episodes.device)
+            place = place + (place >= self._place[episodes])  # skips the frame's own episode
+            partners = self._candidate_list[place]
+            weights = torch.exp(-self.beta * self.nu(episodes, partners))
+        else:
+            log_weights = -self.beta * self.nu(episodes[:, None], self._candidate_list)  # (B, M)
+            log_weights[torch.arange(len(episodes)), self._place[episodes]] = -torch.inf
+            partners = self._candidate_list[torch.multinomial(log_weights.softmax(dim=1), 1).squeeze(1)]
+            weights = log_weights.logsumexp(dim=1).exp() / others
+        return Pairs(
+            torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
+        )
+
+    def _effective_demos(self) -> float:
+        """Kish's effective number of demonstrations that teach a style, from 1 (its own alone) to M.
+
+        (Σ_i W_ij)² / Σ_i W_ij², averaged over styles j; over an even selection of them where there are many.
+        """
+        stride = -(-len(self._candidate_list) // MAX_INSPECTED_STYLES)
+        styles = self._candidate_list[::stride]
+        weights = torch.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
+        return float((weights.sum(dim=0).square() / weights.square().sum(dim=0)).mean())
+
+
+def check_probability(p: float) -> None:
+    """Refuse what is no probability.
+
+    Raises:
+        ValueError: If `p` is outside [0, 1].
+    """
+    if not 0 <= p <= 1:
+        raise ValueError(f"p={p}: the relabelling probability must lie in [0, 1]; the paper uses 0.8")
+
+
+def check_partner_sampling(partner_sampling: str) -> None:
+    """Refuse unknown ways of drawing partners.
+
+    Raises:
+        ValueError: For anything but ``uniform`` and ``weighted``.
+    """
+    if partner_sampling not in ("uniform", "weighted"):
+        raise ValueError(f"partner_sampling={partner_sampling!r}: expected 'uniform' or 'weighted'")
