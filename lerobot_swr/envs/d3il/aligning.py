@@ -187,5 +187,9 @@ def _add_plate_and_walls(body: "mujoco.MjsBody", touchable: bool) -> None:
     add((0.0, 0.0, 0.0), _FLOOR_PLATE, _FLOOR_MASS, _FLOOR_COLOUR, friction=_FLOOR_FRICTION, priority=1)
     for (along_x, along_y), colour in _WALL_COLOURS.items():
         position = (_WALL_OFFSET * along_x, _WALL_OFFSET * along_y, _WALL_Z)
-        size = (_WALL_THICKNESS, _WALL_LENGTH, _WALL_HEIGHT) if along_x else (_WALL_LENGTH, _WALL_THICKNESS, _WALL_HEIGHT)
+        size = (
+            (_WALL_THICKNESS, _WALL_LENGTH, _WALL_HEIGHT)
+            if along_x
+            else (_WALL_LENGTH, _WALL_THICKNESS, _WALL_HEIGHT)
+        )
         add(position, size, _WALL_MASS, colour)

@@ -13,7 +13,9 @@ from lerobot_swr.envs.d3il.simulation import ArmSimulation
 
 Observation = dict[str, np.ndarray]
 
-_OBSERVATION_BOUND = 100.0  # metres; far outside of anything that can be reached, but finite as Gymnasium wants it
+_OBSERVATION_BOUND = (
+    100.0  # metres; far outside of anything that can be reached, but finite as Gymnasium wants it
+)
 
 
 class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):

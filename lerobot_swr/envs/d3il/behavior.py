@@ -30,7 +30,9 @@ GAP_NAMES = (("top", "bottom"), ("top", "mid", "bottom"), ("top", "midtop", "mid
 AVOIDING_BEHAVIORS = tuple(f"{a}-{b}-{c}" for a in GAP_NAMES[0] for b in GAP_NAMES[1] for c in GAP_NAMES[2])
 """The 24 ways through the three levels."""
 
-_LEVEL_1, _LEVEL_2, _LEVEL_3 = (sorted(o.x for o in OBSTACLES if o.name.startswith(f"level{i}")) for i in (1, 2, 3))
+_LEVEL_1, _LEVEL_2, _LEVEL_3 = (
+    sorted(o.x for o in OBSTACLES if o.name.startswith(f"level{i}")) for i in (1, 2, 3)
+)
 _LEVEL_Y = tuple(next(o.y for o in OBSTACLES if o.name.startswith(f"level{i}")) for i in (1, 2, 3))
 _BIT_OFFSETS = (0, 2, 5)
 _TOUCH_TOLERANCE = 0.003  # metres; the rod tilts a little, so that it may touch before its tool point is near
@@ -93,9 +95,7 @@ def avoiding_behavior(observations: Mapping[str, np.ndarray]) -> str:
     gaps: Gaps = (None, None, None)
     for tool_xy in path:
         gaps = gaps_after(gaps, tool_xy)
-    return "-".join(
-        "none" if gap is None else names[gap] for gap, names in zip(gaps, GAP_NAMES, strict=True)
-    )
+    return "-".join("none" if gap is None else names[gap] for gap, names in zip(gaps, GAP_NAMES, strict=True))
 
 
 def rotation_distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -67,7 +67,9 @@ def _rotate_about_z(rotation: np.ndarray, angle: float) -> None:
 
 
 @_compiled
-def tool_kinematics(joints: np.ndarray, position: np.ndarray, rotation: np.ndarray, jacobian: np.ndarray) -> None:
+def tool_kinematics(
+    joints: np.ndarray, position: np.ndarray, rotation: np.ndarray, jacobian: np.ndarray
+) -> None:
     """Pose of the tool centre point and its Jacobian in world axes.
 
     Args:
@@ -116,7 +118,9 @@ def _clip(value: float, limit: float) -> float:
 
 
 @_compiled
-def _task_velocity(desired: np.ndarray, position: np.ndarray, rotation: np.ndarray, target: np.ndarray) -> None:
+def _task_velocity(
+    desired: np.ndarray, position: np.ndarray, rotation: np.ndarray, target: np.ndarray
+) -> None:
     """Write the wanted tool velocity (6,) towards `desired` (3,) with the hand pointing straight down."""
     for row in range(3):
         target[row] = _IK_GAIN[row] * _clip(desired[row] - position[row], _MAX_POSITION_ERROR)
@@ -131,7 +135,9 @@ def _task_velocity(desired: np.ndarray, position: np.ndarray, rotation: np.ndarr
 
 
 @_compiled
-def _cholesky_solve(matrix: np.ndarray, shift: float, lower: np.ndarray, vector: np.ndarray, solve: bool) -> bool:
+def _cholesky_solve(
+    matrix: np.ndarray, shift: float, lower: np.ndarray, vector: np.ndarray, solve: bool
+) -> bool:
     """Factor `matrix` - `shift` I (6, 6) into `lower`; False if it is not positive definite.
 
     With `solve`, overwrite `vector` (6,) with the solution of the shifted system.

@@ -10,7 +10,9 @@ _TABLE_HALF_SIZE = (0.49, 0.98, 0.001)
 _FLOOR_Z = -0.9
 
 
-def new_scene(camera_position: tuple[float, float, float], camera_target: tuple[float, float, float]) -> "mujoco.MjSpec":
+def new_scene(
+    camera_position: tuple[float, float, float], camera_target: tuple[float, float, float]
+) -> "mujoco.MjSpec":
     """A table with the arm on it and no task yet.
 
     Solver and contact settings are the benchmark's (Jia et al., ICLR 2024), since pushes depend on them.
