@@ -12,6 +12,8 @@ from lerobot_swr.envs.d3il.arm_task import ArmTask, Observation
 from lerobot_swr.envs.d3il.behavior import is_aligned, is_inside, rotation_distance
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import (
+    ALIGNING_DESCRIPTION,
+    ALIGNING_SCENE_NAMES,
     ALIGNING_START_JOINTS,
     ALIGNING_START_TOOL,
     ANGLE_RANGE,
@@ -20,9 +22,6 @@ from lerobot_swr.envs.d3il.layouts import (
 )
 from lerobot_swr.envs.d3il.scene import new_scene
 
-ENVIRONMENT_STATE_NAMES = tuple(
-    f"{thing}.{part}" for thing in ("box", "target") for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
-)
 _START_ARM = (*ALIGNING_START_JOINTS, 0.0, 0.0)  # the fingers start closed
 
 # Box: floor plate (half sizes) and four walls; the plate carries nearly all of the mass and slides easily.
@@ -88,14 +87,14 @@ class AligningEnv(ArmTask):
     """
 
     task = "aligning"
-    task_description = "Move the box onto the target and align it with the matching colours."
+    task_description = ALIGNING_DESCRIPTION
 
     def __init__(self, render_mode: str | None = None, render_height: int = 480, render_width: int = 640):
         super().__init__(
             model=aligning_model(),
             start_tool=ALIGNING_START_TOOL,
             n_axes=3,
-            environment_state_size=len(ENVIRONMENT_STATE_NAMES),
+            environment_state_size=len(ALIGNING_SCENE_NAMES),
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,

@@ -10,6 +10,7 @@ from lerobot_swr.envs.d3il.arm_task import ArmTask, Observation
 from lerobot_swr.envs.d3il.behavior import Gaps, gaps_after, mode_bits
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import (
+    AVOIDING_DESCRIPTION,
     AVOIDING_START_JOINTS,
     AVOIDING_START_TOOL,
     FINISH_LINE_Y,
@@ -17,10 +18,6 @@ from lerobot_swr.envs.d3il.layouts import (
 )
 from lerobot_swr.envs.d3il.scene import TABLE_TOP_Z, new_scene
 
-ENVIRONMENT_STATE_NAMES = (
-    *(f"{obstacle.name}.{axis}" for obstacle in OBSTACLES for axis in ("x", "y", "radius")),
-    "finish_line.y",
-)
 _LAYOUT = np.array([v for o in OBSTACLES for v in (o.x, o.y, o.radius)] + [FINISH_LINE_Y], dtype=np.float32)
 _START_QPOS = np.array([*AVOIDING_START_JOINTS, 0.0, 0.0])  # the fingers start closed
 
@@ -55,7 +52,7 @@ class AvoidingEnv(ArmTask):
     """
 
     task = "avoiding"
-    task_description = "Move the rod past the obstacles to the finish line without touching them."
+    task_description = AVOIDING_DESCRIPTION
 
     def __init__(self, render_mode: str | None = None, render_height: int = 480, render_width: int = 640):
         super().__init__(

@@ -41,6 +41,12 @@ OBSTACLES = (
 ROD_RADIUS = 0.01
 FINISH_LINE_Y = 0.35
 AVOIDING_EPISODE_LENGTH = 250
+AVOIDING_DESCRIPTION = "Move the rod past the obstacles to the finish line without touching them."
+AVOIDING_SCENE_NAMES = (
+    *(f"{obstacle.name}.{part}" for obstacle in OBSTACLES for part in ("x", "y", "radius")),
+    "finish_line.y",
+)
+"""Dimensions of the observed ``environment_state``."""
 LEVEL_BAND = 0.03
 """Levels 1 and 2 are judged when the tool first comes this close to their obstacles' y, level 3 when it passes."""
 
@@ -59,6 +65,11 @@ ALIGNING_START_JOINTS = (
     0.08314888038640006, 2.160344058282072, 0.14479521819682337,
 )  # fmt: skip
 ALIGNING_START_TOOL = (0.5249578088772141, -0.34881810941048447, 0.25159789342766353)
+ALIGNING_DESCRIPTION = "Move the box onto the target and align it with the matching colours."
+ALIGNING_SCENE_NAMES = tuple(
+    f"{thing}.{part}" for thing in ("box", "target") for part in ("x", "y", "z", "qw", "qx", "qy", "qz")
+)
+"""Dimensions of the observed ``environment_state``."""
 BOX_SIDE = 0.11
 """Outer side of the box; its walls are 0.01 thick and the box is open at the top."""
 BOX_POSITION_RANGE = ((0.4, 0.6), (-0.25, -0.1))
