@@ -13,8 +13,8 @@ BehaviorRule = Callable[[Mapping[str, np.ndarray]], str]
 """Maps an episode's observations, ``{"observation.state": (T, d), ...}``, to a label.
 
 The keys are LeRobot's feature names; T counts the states of the episode, the last one included where it is
-known (rollouts) or recorded (demonstrations). An episode that fails the task gets a label of its own, which no
-successful episode has.
+known (rollouts) or recorded (demonstrations). An episode that fails the task gets a label of its own, which
+no successful episode has.
 """
 
 

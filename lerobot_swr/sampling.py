@@ -1,4 +1,4 @@
-"""The similarity-weighted sampler: draws which demonstration's style a frame is relabelled with (algorithm 1)."""
+"""The similarity-weighted sampler: draws whose style a frame teaches (algorithm 1)."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -33,11 +33,11 @@ class SimilarityWeightedSampler:
     """Draws pairs (i, j) for given episodes i, with j ≠ i at probability p.
 
     ``uniform`` draws j uniformly and weights the loss by W(τ_i, τ_j), as the paper does; ``weighted`` draws
-    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and a lower variance. Draws come
-    from torch's global generator, which LeRobot saves and restores with a checkpoint.
+    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and a lower variance. Draws
+    come from torch's global generator, which LeRobot saves and restores with a checkpoint.
 
-    Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`. The
-    normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
+    Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.
+    The normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
 
     Args:
         distances: (N, N) distances of the episodes.

@@ -109,7 +109,8 @@ def dissimilarity_matrix(states: Sequence[np.ndarray], normalization: Normalizat
         (N, N) float64 in [0, 1]: 0 on the diagonal, 1 for the farthest episode.
 
     Raises:
-        ValueError: If an episode is empty, of another dimension or not finite, or for an unknown normalization.
+        ValueError: If an episode is empty, of another dimension or not finite, or for an unknown
+            normalization.
     """
     check_normalization(normalization)
     return normalize_distances(pairwise_distances(states), normalization)

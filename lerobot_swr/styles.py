@@ -73,8 +73,8 @@ class StyleCookbook(nn.Module):
         untrained = [episode for episode in self.selected if not trained[episode]]
         if untrained:
             raise ValueError(
-                f"style_episodes={list(self.selected)}: episodes {untrained} were not in the training data of "
-                f"this checkpoint, so they have no style; {int(trained.sum())} of {len(self)} episodes do"
+                f"style_episodes={list(self.selected)}: episodes {untrained} were not in the training data "
+                f"of this checkpoint, so they have no style; {int(trained.sum())} of {len(self)} episodes do"
             )
         return torch.tensor(list(self.selected), device=self.trained.device)
 

@@ -80,15 +80,17 @@ def load_trajectories(meta: LeRobotDatasetMetadata, keys: Sequence[str]) -> Traj
             f"dataset {name}: no data/chunk-*/file-*.parquet; download the dataset first "
             "(streamed datasets are not supported, they hide the episodes)"
         )
-    table = pa.concat_tables([pq.read_table(file, columns=["index", "episode_index", *keys]) for file in files])
+    table = pa.concat_tables(
+        [pq.read_table(file, columns=["index", "episode_index", *keys]) for file in files]
+    )
     table = table.sort_by("index")
     columns = {key: _as_array(table.column(key), key, name) for key in keys}
     episode_index = table.column("episode_index").to_numpy()
     lengths = np.bincount(episode_index, minlength=meta.total_episodes).astype(np.int64)
     if len(lengths) != meta.total_episodes or (lengths == 0).any() or (np.diff(episode_index) < 0).any():
         raise ValueError(
-            f"dataset {name}: meta/info.json promises {meta.total_episodes} episodes in order, the data files "
-            f"hold {len(np.unique(episode_index))}; is the dataset complete (was it finalized)?"
+            f"dataset {name}: meta/info.json promises {meta.total_episodes} episodes in order, the data "
+            f"files hold {len(np.unique(episode_index))}; is the dataset complete (was it finalized)?"
         )
     trajectories = Trajectories(lengths, columns, meta.fps, name)
     _check_finite(trajectories, episode_index)

@@ -6,6 +6,7 @@ were fixed before any method was trained on the datasets; units are shares of th
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 from scipy.interpolate import PchipInterpolator
@@ -48,7 +49,7 @@ def forward_path(checkpoints: str, layout: MazeLayout, rng: np.random.Generator)
     points.append(np.array(layout.goal) + goal_jitter)
 
     with_free_points = [points[0]]
-    for before, after in zip(points[:-1], points[1:], strict=True):
+    for before, after in pairwise(points):
         share = rng.uniform(0.35, 0.65)
         free = before + share * (after - before)
         free[0] = np.clip(free[0] + PATH_SPREAD * rng.standard_normal(), 0.03, 0.97)
@@ -118,9 +119,7 @@ def spread_lengths(rng: np.random.Generator, path_length: float) -> float:
     return path_length / rng.uniform(62, 107)
 
 
-def demonstrate(
-    task: str, behaviors: Sequence[str], speed: SpeedRule, seed: int
-) -> Iterator[Demonstration]:
+def demonstrate(task: str, behaviors: Sequence[str], speed: SpeedRule, seed: int) -> Iterator[Demonstration]:
     """One demonstration per entry of `behaviors`, in an order shuffled by the seed."""
     rng = np.random.default_rng(seed)
     layout = get_layout(task)

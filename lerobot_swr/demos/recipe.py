@@ -13,8 +13,9 @@ class Demonstration:
     """One recorded episode.
 
     Attributes:
-        observations: LeRobot feature name to a float32 array (T, d): the state in which each action was taken.
-            The last one already fulfils the task, so that the behaviour can be read from the states alone.
+        observations: LeRobot feature name to a float32 array (T, d): the state in which each action was
+            taken. The last one already fulfils the task, so that the behaviour can be read from the states
+            alone.
         actions: (T, A) float32, the action taken in each state, in the environment's units.
     """
 

@@ -44,8 +44,8 @@ class TaskEnvConfig(EnvConfig):
     ) -> dict[str, dict[int, gym.vector.VectorEnv]]:
         """LeRobot's vector environment for this task, whose finished episodes keep their last observation.
 
-        Unlike LeRobot's default, a finished sub-environment is frozen instead of being reset at once: its last
-        state is needed to label the behaviour, and it costs nothing while slower episodes go on.
+        Unlike LeRobot's default, a finished sub-environment is frozen instead of being reset at once: its
+        last state is needed to label the behaviour, and it costs nothing while slower episodes go on.
         """
         make_one = partial(
             gym.make, self.gym_id, disable_env_checker=self.disable_env_checker, **self.gym_kwargs

@@ -123,4 +123,6 @@ def load_reference(source: DatasetSource, checkpoint: Checkpoint) -> Trajectorie
 
 
 def _is_low_dimensional(key: str, feature: dict) -> bool:
-    return (key.startswith("observation.") or key == "action") and feature["dtype"].startswith(("float", "int"))
+    return (key.startswith("observation.") or key == "action") and feature["dtype"].startswith(
+        ("float", "int")
+    )

@@ -96,7 +96,9 @@ def l1_interval(labels_by_seed: Sequence[Sequence[str]], reference: Mapping[str,
     names = sorted({label for labels in labels_by_seed for label in labels} | set(reference))
     place = {label: i for i, label in enumerate(names)}
     reference_shares = np.array([reference.get(label, 0.0) for label in names])
-    shares = [np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed]
+    shares = [
+        np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed
+    ]
     scores = []
     for _ in range(BOOTSTRAP_DRAWS):
         chosen = rng.integers(len(shares), size=len(shares))
@@ -114,8 +116,9 @@ def success_interval(successes: Sequence[bool]) -> Interval:
 def success_entropy(labels: Sequence[str], successes: Sequence[bool], n_behaviors: int) -> float:
     """Entropy of the behaviours of successful rollouts, in units of log `n_behaviors`.
 
-    D3IL's convention for Avoiding (Jia et al., ICLR 2024): failures are left out and the base of the logarithm
-    is the number of behaviours in the demonstrations; 1 is uniform, 0 a single behaviour or no success.
+    D3IL's convention for Avoiding (Jia et al., ICLR 2024): failures are left out and the base of the
+    logarithm is the number of behaviours in the demonstrations; 1 is uniform, 0 a single behaviour or no
+    success.
     """
     counts = np.array(list(Counter(la for la, ok in zip(labels, successes, strict=True) if ok).values()))
     if len(counts) == 0 or n_behaviors < 2:

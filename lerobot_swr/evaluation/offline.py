@@ -29,8 +29,9 @@ class OfflineResult:
     Attributes:
         n_episodes: Episodes evaluated: those that were trained on, for a style policy.
         n_frames: Their frames.
-        action_error: Kind of style (``own``, ``nearest``, ``random``, or ``none`` for a policy without styles) to
-            the mean over frames of the squared error of the normalised action, itself a mean over dimensions.
+        action_error: Kind of style (``own``, ``nearest``, ``random``, or ``none`` for a policy without
+            styles) to the mean over frames of the squared error of the normalised action, itself a mean over
+            dimensions.
         action_error_interval: Its bootstrap 95 % interval over episodes.
         action_error_by_dimension: The same mean for each action dimension, in order.
     """
@@ -155,7 +156,7 @@ def summarize(errors: FrameErrors) -> OfflineResult:
 def format_offline(result: OfflineResult) -> str:
     """A table for the terminal."""
     lines = [
-        f"{result.n_frames} frames of {result.n_episodes} episodes; mean squared action error, normalised units"
+        f"{result.n_frames} frames of {result.n_episodes} episodes; mean squared error, normalised actions"
     ]
     for kind, error in result.action_error.items():
         interval = result.action_error_interval[kind]

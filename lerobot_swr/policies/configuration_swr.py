@@ -1,8 +1,8 @@
 """Configurations of the policies ``bc``, ``zbc`` and ``wzbc``.
 
 The method is that of *Offline Learning of Controllable Diverse Behaviors* (Petitbois, Portelas, Lamprier,
-Denoyer; arXiv 2504.18160), "the paper". Defaults are the paper's values, except where a comment says otherwise;
-`docs/method.md` gives the reasons and the flags of the paper's literal network.
+Denoyer; arXiv 2504.18160), "the paper". Defaults are the paper's values, except where a comment says
+otherwise; `docs/method.md` gives the reasons and the flags of the paper's literal network.
 """
 
 from dataclasses import dataclass, field
@@ -133,7 +133,7 @@ class BCConfig(PreTrainedConfig):
 @PreTrainedConfig.register_subclass("zbc")
 @dataclass
 class ZBCConfig(BCConfig):
-    """Style-conditioned behaviour cloning: one trainable style per demonstration (the paper's eq. 1 and 2)."""
+    """Style-conditioned behaviour cloning: one trainable style per demonstration (eq. 1 and 2)."""
 
     # --- Styles ---
     # Dimension of a style z.
@@ -166,7 +166,10 @@ class ZBCConfig(BCConfig):
 @PreTrainedConfig.register_subclass("wzbc")
 @dataclass
 class WZBCConfig(ZBCConfig):
-    """ZBC with similarity weighted regression: similar demonstrations teach each other's styles (algorithm 1)."""
+    """ZBC with similarity weighted regression: algorithm 1.
+
+    Similar demonstrations teach each other's styles.
+    """
 
     # --- Similarity weighted regression ---
     # Inverse temperature of the weights exp(-beta * nu): 0 lets every demonstration teach every style, large

@@ -41,17 +41,15 @@ class BCPolicy(PreTrainedPolicy):
         **kwargs: Whatever else LeRobot's factory passes (``dataset_stats``).
 
     Raises:
-        ValueError: If the dataset lacks ``observation.state`` or ``action`` or holds NaN, or if a resumed run's
-            dataset is not the checkpoint's.
+        ValueError: If the dataset lacks ``observation.state`` or ``action`` or holds NaN, or if a resumed
+            run's dataset is not the checkpoint's.
     """
 
     config_class = BCConfig
     name = "bc"
     config: BCConfig
 
-    def __init__(
-        self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any
-    ):
+    def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config)
         config.validate_features()
         self._leave_out_images()
@@ -90,7 +88,7 @@ class BCPolicy(PreTrainedPolicy):
             self.config.input_features = {key: ft for key, ft in inputs.items() if key not in images}
 
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
-        """Read the training dataset's episodes and tell whether the checkpoint, if any, was trained on them."""
+        """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
         config = self.config
         self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION])
         self._dataset_root = Path(meta.root)
@@ -118,9 +116,7 @@ class BCPolicy(PreTrainedPolicy):
         """All parameters."""
         return self.parameters()
 
-    def forward(
-        self, batch: dict[str, Tensor], reduction: str = "mean"
-    ) -> tuple[Tensor, dict[str, float]]:
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Training loss of a batch of frames.
 
         Args:
@@ -205,8 +201,8 @@ class BCPolicy(PreTrainedPolicy):
 class ZBCPolicy(BCPolicy):
     """Style-conditioned behaviour cloning (ZBC): one trainable style per demonstration.
 
-    Training fits π_θ(a | s, z_i) to each demonstration τ_i with its own style (eq. 1). A rollout draws one style
-    per environment at its first action and keeps it to the end (eq. 2).
+    Training fits π_θ(a | s, z_i) to each demonstration τ_i with its own style (eq. 1). A rollout draws one
+    style per environment at its first action and keeps it to the end (eq. 2).
 
     Attributes:
         styles: The cookbook {z_i}.
@@ -216,9 +212,7 @@ class ZBCPolicy(BCPolicy):
     name = "zbc"
     config: ZBCConfig
 
-    def __init__(
-        self, config: ZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any
-    ):
+    def __init__(self, config: ZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
         if config.num_episodes is None:
             raise ValueError(
@@ -272,7 +266,9 @@ class ZBCPolicy(BCPolicy):
             RuntimeError: If the policy was created without a dataset.
         """
         if self._trajectories is None or self._dataset_root is None:
-            raise RuntimeError("distances between episodes need the dataset: create the policy with dataset_meta")
+            raise RuntimeError(
+                "distances between episodes need the dataset: create the policy with dataset_meta"
+            )
         return cached_distances(self._trajectories, self.config.observation_keys, self._dataset_root)
 
     def reset(self) -> None:
@@ -301,8 +297,8 @@ class WZBCPolicy(ZBCPolicy):
     """ZBC with similarity weighted regression (WZBC): similar demonstrations teach each other's styles.
 
     With probability p a frame of τ_i is relabelled with the style z_j of another demonstration; its loss is
-    weighted by W(τ_i, τ_j) and sends no gradient into z_j (algorithm 1). The pairs are drawn here, in `forward`,
-    because LeRobot's frame sampler belongs to its training loop.
+    weighted by W(τ_i, τ_j) and sends no gradient into z_j (algorithm 1). The pairs are drawn here, in
+    `forward`, because LeRobot's frame sampler belongs to its training loop.
 
     Raises:
         ValueError: In addition to `ZBCPolicy`, if the dataset has a single episode.
@@ -312,16 +308,14 @@ class WZBCPolicy(ZBCPolicy):
     name = "wzbc"
     config: WZBCConfig
 
-    def __init__(
-        self, config: WZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any
-    ):
+    def __init__(self, config: WZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
         self.sampler: SimilarityWeightedSampler | None = None
         if dataset_meta is not None:
             if len(self.styles) < 2:
                 raise ValueError(
-                    f"dataset.root={str(dataset_meta.root)!r} has a single episode; wzbc compares episodes and "
-                    "needs at least 2: record more, or use --policy.type=zbc"
+                    f"dataset.root={str(dataset_meta.root)!r} has a single episode; wzbc compares episodes "
+                    "and needs at least 2: record more, or use --policy.type=zbc"
                 )
             self.sampler = SimilarityWeightedSampler(
                 self.distances(),
@@ -335,7 +329,9 @@ class WZBCPolicy(ZBCPolicy):
         """(N, N) distances of the training dataset's episodes over the configured features."""
         keys = self.config.similarity_keys or self.config.observation_keys
         if self._trajectories is None or self._dataset_root is None:
-            raise RuntimeError("distances between episodes need the dataset: create the policy with dataset_meta")
+            raise RuntimeError(
+                "distances between episodes need the dataset: create the policy with dataset_meta"
+            )
         unknown = [key for key in keys if key not in self._trajectories.columns]
         if unknown:
             raise ValueError(
@@ -346,10 +342,10 @@ class WZBCPolicy(ZBCPolicy):
     def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """(B,) loss of each frame: W(τ_i, τ_j) · |π(s, z_j) − a|², with j = i where it is not relabelled.
 
-        Figures to log: ``own_style_loss`` and ``relabelled_loss``, the mean error of the frames that keep their
-        style and of those that do not, before weighting; ``mean_weight`` of the latter; and ``effective_demos``
-        per style. The first three divide by the expected number of such frames, not by the batch's, so that a
-        batch without any is no special case and their averages over time are unbiased.
+        Figures to log: ``own_style_loss`` and ``relabelled_loss``, the mean error of the frames that keep
+        their style and of those that do not, before weighting; ``mean_weight`` of the latter; and
+        ``effective_demos`` per style. The first three divide by the expected number of such frames, not by
+        the batch's, so that a batch without any is no special case and their averages over time are unbiased.
         """
         if not self.training or self.sampler is None:
             return super().frame_losses(batch)

@@ -1,6 +1,7 @@
 """The network: observation encoder, style, trunk and action head, each replaceable on its own."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -35,9 +36,7 @@ class Trunk(nn.Module):
     def __init__(self, in_dim: int, hidden_dim: int, num_hidden: int, residual: bool):
         super().__init__()
         dims = [in_dim] + [hidden_dim] * num_hidden
-        self.layers = nn.ModuleList(
-            nn.Linear(before, after) for before, after in zip(dims[:-1], dims[1:], strict=True)
-        )
+        self.layers = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(dims))
         self.residual = residual
 
     def forward(self, features: Tensor) -> Tensor:

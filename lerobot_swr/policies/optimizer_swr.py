@@ -1,4 +1,4 @@
-"""Adam with PyTorch's fused kernel as a LeRobot optimizer: twice as fast as plain Adam for small networks on CPU."""
+"""Adam with PyTorch's fused kernel as a LeRobot optimizer: twice as fast for small networks on CPU."""
 
 from dataclasses import asdict, dataclass
 

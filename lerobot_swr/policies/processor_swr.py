@@ -14,6 +14,7 @@ Pipelines = tuple[
 ]
 Statistics = dict[str, dict[str, Any]]
 
+
 def make_bc_pre_post_processors(config: BCConfig, dataset_stats: Statistics | None = None) -> Pipelines:
     """LeRobot's default pipelines; constant dimensions are centred instead of being blown up."""
     return make_default_pre_post_processors(config, _with_unit_std_where_constant(config, dataset_stats))
@@ -26,8 +27,8 @@ make_wzbc_pre_post_processors = make_bc_pre_post_processors
 def _with_unit_std_where_constant(config: BCConfig, stats: Statistics | None) -> Statistics | None:
     """Set the standard deviation of constant dimensions to 1.
 
-    LeRobot divides by std + 1e-8, so the rounding error of a constant's mean would become an input or a target
-    of the order of 1.
+    LeRobot divides by std + 1e-8, so the rounding error of a constant's mean would become an input or a
+    target of the order of 1.
     """
     if stats is None:
         return None

@@ -10,8 +10,8 @@ from lerobot_swr.envs.maze2d.layouts import MazeLayout
 def checkpoints_passed(positions: np.ndarray, layout: MazeLayout) -> str:
     """The checkpoints of one episode in the order in which they are first passed.
 
-    A door is passed when two consecutive positions lie on different sides of its wall; the goal (checkpoint 0)
-    is passed at the first position inside the goal disc, and ends the label.
+    A door is passed when two consecutive positions lie on different sides of its wall; the goal (checkpoint
+    0) is passed at the first position inside the goal disc, and ends the label.
 
     Args:
         positions: (T, 2) positions in the unit square.

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
-from lerobot_swr.envs.maze2d.env import FPS, MazeAgents, Maze2DVectorEnv
+from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import get_layout
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
@@ -110,7 +110,9 @@ class Maze2DEnvConfig(TaskEnvConfig):
             edges = [0.0]
             for door in sorted(wall.doors, key=lambda door: door.x):
                 edges += [door.x - door.half_width, door.x + door.half_width]
-                axes.text(door.x, wall.y, str(door.checkpoint), color="0.5", ha="center", va="center")
+                axes.text(
+                    door.x, wall.y, str(door.checkpoint), color="0.4", ha="center", va="center", zorder=5
+                )
             edges.append(1.0)
             for left, right in zip(edges[::2], edges[1::2], strict=True):
                 axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")

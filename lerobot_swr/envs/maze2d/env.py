@@ -85,11 +85,11 @@ class Maze2DEnv(gym.Env):
     | `agent_pos` | (2,) | x, y of the agent, as shares of the maze's side | 0 to 1 |
     | `environment_state` | (2,) | x, y of the goal | 0 to 1 |
 
-    **Action** (2,) float32 in -1 to 1: displacement in x and y, in units of 0.02 of the side. Larger values are
-    clipped. Walls and the border stop the agent; by default it slides along them.
+    **Action** (2,) float32 in -1 to 1: displacement in x and y, in units of 0.02 of the side. Larger values
+    are clipped. Walls and the border stop the agent; by default it slides along them.
 
-    **Start**: `fixed` (the layout's start), `pseudo_random` (uniform in a square around it, cut at the border) or
-    `random` (uniform in the maze).
+    **Start**: `fixed` (the layout's start), `pseudo_random` (uniform in a square around it, cut at the
+    border) or `random` (uniform in the maze).
 
     **Reward**: 1 when the goal is reached, else 0. **Termination**: goal reached. **Truncation**: by the
     registered step limit (200).
@@ -105,7 +105,8 @@ class Maze2DEnv(gym.Env):
         task: Layout: `small` (2 forward behaviours), `medium` (12) or `large` (24).
         start: `fixed`, `pseudo_random` or `random`.
         start_radius: Half the side of the pseudo-random start square, as a share of the maze's side.
-        transition_noise: Standard deviation of Gaussian noise on every displacement, in units of the largest step.
+        transition_noise: Standard deviation of Gaussian noise on every displacement, in units of the largest
+            step.
         sticky_walls: An agent that hits a wall or the border does not move in that step.
         render_size: Side of the rendered picture, in pixels.
         render_mode: `rgb_array` or None.
@@ -142,9 +143,7 @@ class Maze2DEnv(gym.Env):
         self._path = [self.agents.draw_start(self.np_random)]
         return self._observe(), {"is_success": False}
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Apply a (2,) action."""
         positions, reached = self.agents.step(
             self._path[-1][None], np.asarray(action)[None], [self.np_random]
@@ -185,7 +184,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
-        self._positions = np.zeros((num_envs, 2))
+        self._positions: np.ndarray = np.zeros((num_envs, 2))
         self._terminated = np.zeros(num_envs, dtype=bool)
         self._steps = 0
 
@@ -216,7 +215,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         return self.agents.observe(self._positions), reward, self._terminated.copy(), truncated, info
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """The attribute or method result `name`, once per agent, as Gymnasium's vector environments give it."""
+        """The attribute or method result `name`, once per agent."""
         value = getattr(self, name)
         return (value(*args, **kwargs) if callable(value) else value,) * self.num_envs
 

@@ -27,7 +27,9 @@ def draw_maze(layout: MazeLayout, size: int) -> Image.Image:
     for wall in layout.walls:
         left = 0.0
         for door in sorted(wall.doors, key=lambda door: door.x):
-            draw.line((*pixel(left, wall.y), *pixel(door.x - door.half_width, wall.y)), fill=WALL, width=width)
+            draw.line(
+                (*pixel(left, wall.y), *pixel(door.x - door.half_width, wall.y)), fill=WALL, width=width
+            )
             draw.text(pixel(door.x, wall.y), str(door.checkpoint), fill=DOOR, font=font, anchor="mm")
             left = door.x + door.half_width
         draw.line((*pixel(left, wall.y), *pixel(1.0, wall.y)), fill=WALL, width=width)
