@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -34,7 +35,9 @@ class DatasetRecipe:
         robot_type: Stored in the dataset's metadata.
         features: LeRobot feature name (observations and ``action``) to the names of its dimensions.
         n_episodes: Number of demonstrations.
-        demonstrations: Maps a seed to the episodes, in their order in the dataset. Deterministic in the seed.
+        demonstrations: Maps a seed and a folder to the episodes, in their order in the dataset. Deterministic in
+            the seed. A source that takes long may keep finished episodes in the folder (not yet made, unless by
+            an interrupted run with the same seed) and continue from them.
         behavior_rule: Labels an episode of this dataset.
     """
 
@@ -44,5 +47,5 @@ class DatasetRecipe:
     robot_type: str
     features: Mapping[str, tuple[str, ...]]
     n_episodes: int
-    demonstrations: Callable[[int], Iterator[Demonstration]]
+    demonstrations: Callable[[int, Path], Iterator[Demonstration]]
     behavior_rule: BehaviorRule
