@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lerobot_swr.demos.box_steering import (
-    INSIDE_CORNER,
-    OUTSIDE_FACE,
     Gains,
+    Grip,
     PlanePose,
     from_frame,
     heading_costs,
@@ -34,7 +33,7 @@ class Habits:
     """What differs between two demonstrations.
 
     Attributes:
-        inside: Pull from inside or push from outside.
+        grip: Where the rod takes hold of the box.
         choice: Which of the headings is taken, in the order of their costs (0: the best).
         gains: Of the steering.
         pace: Relative speed.
@@ -44,7 +43,7 @@ class Habits:
         tremor: Standard deviation of the hand's noise, m.
     """
 
-    inside: bool
+    grip: Grip
     choice: int
     gains: Gains
     pace: float
@@ -75,7 +74,6 @@ class BoxHandler:
     def __init__(self, habits: Habits, rng: np.random.Generator):
         self.habits = habits
         self._rng = rng
-        self._grip = INSIDE_CORNER if habits.inside else OUTSIDE_FACE
         self._phase = Phase.LIFT
         self._psi: float | None = None
         self._grips = 0
@@ -95,15 +93,15 @@ class BoxHandler:
         return _limited(step, MAX_STEP)
 
     def _choose_heading(self, box: PlanePose, target: PlanePose) -> float:
-        costs = heading_costs(box, target, self._grip)
+        costs = heading_costs(box, target, self.habits.grip)
         choice = self.habits.choice if self._grips == 0 else 0
-        return headings(self._grip)[int(np.argsort(costs)[choice])]
+        return headings(self.habits.grip)[int(np.argsort(costs)[choice])]
 
     def _next_step(
         self, desired: np.ndarray, actual: np.ndarray, box: PlanePose, target: PlanePose
     ) -> np.ndarray:
         assert self._psi is not None
-        habits, grip = self.habits, self._grip
+        habits, grip = self.habits, self.habits.grip
         heading = PlanePose(box.x, box.y, box.angle + self._psi)
         goal = PlanePose(target.x, target.y, target.angle + self._psi)
         rod = to_frame(actual[:2] - box.position, heading.angle)
@@ -147,7 +145,7 @@ class BoxHandler:
 
     def _lost(self, rod: np.ndarray) -> bool:
         """Whether the rod, at `rod` (2,) in the heading frame, cannot move the box on as intended."""
-        if self._grip.inside:
+        if self.habits.grip.inside:
             return bool(np.linalg.norm(rod) > 0.075)
         return bool(abs(rod[1]) > 0.064 or rod[0] < -0.11)
 

@@ -1,9 +1,9 @@
-"""Steering a box over a table with a rod: pushing it from behind or pulling it from inside one of its corners.
+"""Steering a box over a table with a rod: pushing it from behind, or pulling it from inside.
 
-Both are the same problem as parking a trailer. Sliding slowly, the box moves as if its pressure were concentrated
-on a limit surface: a force (f1, f2) at the contact point makes it move along the force and turn by the moment over
-``COMPLIANCE``. So the contact point's velocity in the box's heading frame decides the curvature of the path of a
-*pivot* on the heading axis, and a pose-stabilising law for that pivot brings the box to its target pose.
+Both are the same problem as parking a trailer. Sliding slowly, the box obeys a limit surface: a force (f1, f2) at
+the contact point makes it move along the force and turn by the moment over a *compliance*. So the contact point's
+velocity in the box's heading frame decides the curvature of the path of a *pivot* on the heading axis, and a
+pose-stabilising law for that pivot brings the box to its target pose.
 
 All quantities are in the table's plane; the heading frame has its origin in the box's centre and its first axis
 along the heading, the direction in which the box is moved.
@@ -14,11 +14,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-
-COMPLIANCE = 0.0045
-"""m^2; turn per moment relative to motion per force. The box rests on the corners of its plate, which gives
-nearly the squared distance of a corner, 0.005."""
-
 
 class PlanePose(NamedTuple):
     """Position in m and direction in rad."""
@@ -38,25 +33,30 @@ class Grip:
     """Where the rod touches the box, on the heading axis of the heading frame.
 
     Attributes:
-        inside: Pull from inside a corner (ahead of the centre) or push at a face (behind it).
-        contact: x of the contact point.
-        above: x over which the rod is lowered.
-        touching: x of the rod from which it can be taken to touch.
+        inside: Pull from inside (ahead of the centre) or push at a face (behind it).
+        corner: Hold the rod in a corner, which takes force in any forward direction, or at a wall, by friction.
+        contact: x of the contact point, m.
+        above: x over which the rod is lowered, m.
+        touching: x of the rod from which it can be taken to touch, m.
+        compliance: Turn per moment relative to motion per force, m^2.
     """
 
     inside: bool
+    corner: bool
     contact: float
     above: float
     touching: float
+    compliance: float
 
     @property
     def pivot(self) -> float:
         """x of the point that moves along the heading, whatever the curvature."""
-        return -COMPLIANCE / self.contact
+        return -self.compliance / self.contact
 
 
-INSIDE_CORNER = Grip(inside=True, contact=0.0495, above=0.03, touching=0.0465)
-OUTSIDE_FACE = Grip(inside=False, contact=-0.055, above=-0.088, touching=-0.0665)
+INSIDE_CORNER = Grip(True, True, contact=0.0495, above=0.03, touching=0.0465, compliance=0.0015)
+INSIDE_WALL = Grip(True, False, contact=0.045, above=0.015, touching=0.033, compliance=0.0027)
+OUTSIDE_FACE = Grip(False, False, contact=-0.055, above=-0.088, touching=-0.0665, compliance=0.0045)
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,8 @@ def from_frame(vector: np.ndarray, angle: float) -> np.ndarray:
 
 
 def headings(grip: Grip) -> list[float]:
-    """The four headings relative to the box's yaw: its corners (inside) or its faces (outside)."""
-    return [(math.pi / 4 if grip.inside else 0.0) + k * math.pi / 2 for k in range(4)]
+    """The four headings relative to the box's yaw: its corners or its faces."""
+    return [(math.pi / 4 if grip.corner else 0.0) + k * math.pi / 2 for k in range(4)]
 
 
 def heading_costs(box: PlanePose, target: PlanePose, grip: Grip) -> np.ndarray:
@@ -140,13 +140,13 @@ def rod_directions(curvature: float, rod_y: float, grip: Grip) -> tuple[np.ndarr
         grip: Where the rod touches.
     """
     x = grip.contact
-    if grip.inside:
+    if grip.corner:
         angle = np.clip(math.atan(curvature * (x - grip.pivot)), -math.radians(78), math.radians(78))
         velocity = direction(float(angle))
-        force = np.array([velocity[0], velocity[1] / (1 + x * x / COMPLIANCE)])
+        force = np.array([velocity[0], velocity[1] / (1 + x * x / grip.compliance)])
     else:
         # Friction between rod and box is 1; a little less keeps the rod from slipping along the face.
-        force = np.array([1.0, np.clip((curvature * COMPLIANCE + rod_y) / x, -0.9, 0.9)])
-        turn = (x * force[1] - rod_y * force[0]) / COMPLIANCE
+        force = np.array([1.0, np.clip((curvature * grip.compliance + rod_y) / x, -0.9, 0.9)])
+        turn = (x * force[1] - rod_y * force[0]) / grip.compliance
         velocity = force + turn * np.array([-rod_y, x])
     return velocity / np.linalg.norm(velocity), force / np.linalg.norm(force)

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from lerobot_swr.demos.box_handler import BoxHandler, Habits
-from lerobot_swr.demos.box_steering import Gains
+from lerobot_swr.demos.box_steering import INSIDE_CORNER, INSIDE_WALL, OUTSIDE_FACE, Gains
 from lerobot_swr.demos.parallel_generation import generate
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.envs.d3il.behavior import INSIDE, OUTSIDE, aligning_behavior
@@ -30,7 +30,7 @@ def draw_habits(inside: bool, attempt: int, rng: np.random.Generator) -> Habits:
     spread = 1.0 if attempt == 0 else 2.0
     turn, smallest = (1.2, 0.1) if inside else (2.0, 0.0)
     return Habits(
-        inside=inside,
+        grip=INSIDE_CORNER if inside else OUTSIDE_FACE,
         choice=int(rng.choice([0, 1], p=[0.5, 0.5])) if attempt else 0,
         gains=Gains(
             turn=turn * np.exp(0.08 * spread * rng.standard_normal()),

@@ -11,6 +11,7 @@ from lerobot_swr.envs.d3il.behavior import Gaps, gaps_after, mode_bits
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import (
     AVOIDING_DESCRIPTION,
+    AVOIDING_SCENE,
     AVOIDING_START_JOINTS,
     AVOIDING_START_TOOL,
     FINISH_LINE_Y,
@@ -18,7 +19,6 @@ from lerobot_swr.envs.d3il.layouts import (
 )
 from lerobot_swr.envs.d3il.scene import TABLE_TOP_Z, new_scene
 
-_LAYOUT = np.array([v for o in OBSTACLES for v in (o.x, o.y, o.radius)] + [FINISH_LINE_Y], dtype=np.float32)
 _START_QPOS = np.array([*AVOIDING_START_JOINTS, 0.0, 0.0])  # the fingers start closed
 
 
@@ -59,7 +59,7 @@ class AvoidingEnv(ArmTask):
             model=avoiding_model(),
             start_tool=AVOIDING_START_TOOL,
             n_axes=2,
-            environment_state_size=len(_LAYOUT),
+            environment_state_size=len(AVOIDING_SCENE),
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
@@ -77,7 +77,7 @@ class AvoidingEnv(ArmTask):
         self._collision = self._success = False
 
     def _observation(self) -> Observation:
-        return {"agent_pos": self._agent_pos(), "environment_state": _LAYOUT.copy()}
+        return {"agent_pos": self._agent_pos(), "environment_state": AVOIDING_SCENE.copy()}
 
     def _judge(self) -> None:
         # Judged on the observed float32 position, so that the behaviour rule cannot disagree by a rounding.

@@ -47,6 +47,10 @@ AVOIDING_SCENE_NAMES = (
     "finish_line.y",
 )
 """Dimensions of the observed ``environment_state``."""
+AVOIDING_SCENE = np.array(
+    [value for o in OBSTACLES for value in (o.x, o.y, o.radius)] + [FINISH_LINE_Y], dtype=np.float32
+)
+"""(19,) the ``environment_state`` of avoiding, which never changes."""
 LEVEL_BAND = 0.03
 """Levels 1 and 2 are judged when the tool first comes this close to their obstacles' y, level 3 when it passes."""
 
