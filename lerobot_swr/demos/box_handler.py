@@ -153,7 +153,9 @@ class BoxHandler:
 def _plane_pose(pose: np.ndarray) -> PlanePose:
     """Position and yaw of a (7,) pose."""
     w, x, y, z = (float(part) for part in pose[3:7])
-    return PlanePose(float(pose[0]), float(pose[1]), wrap(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
+    return PlanePose(
+        float(pose[0]), float(pose[1]), wrap(math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+    )
 
 
 def _limited(step: np.ndarray, limit: float) -> np.ndarray:

@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 
 from lerobot_swr.demos.box_handler import BoxHandler, Habits
-from lerobot_swr.demos.box_steering import INSIDE_CORNER, INSIDE_WALL, OUTSIDE_FACE, Gains
+from lerobot_swr.demos.box_steering import INSIDE_CORNER, OUTSIDE_FACE, Gains
 from lerobot_swr.demos.parallel_generation import generate
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.envs.d3il.behavior import INSIDE, OUTSIDE, aligning_behavior
@@ -28,7 +28,7 @@ MAX_ATTEMPTS = 12
 def draw_habits(inside: bool, attempt: int, rng: np.random.Generator) -> Habits:
     """Habits of one attempt; later attempts are also ready to take a less obvious face or corner."""
     spread = 1.0 if attempt == 0 else 2.0
-    turn, smallest = (1.2, 0.1) if inside else (2.0, 0.0)
+    turn, smallest = (1.2, 0.05) if inside else (2.0, 0.0)
     return Habits(
         grip=INSIDE_CORNER if inside else OUTSIDE_FACE,
         choice=int(rng.choice([0, 1], p=[0.5, 0.5])) if attempt else 0,

@@ -131,7 +131,9 @@ class AvoidingJob:
             demonstration = record(draw_set_points(draw_path(self.behaviors[i], rng), rng))
             if avoiding_behavior(demonstration.observations) == self.behaviors[i]:
                 return demonstration
-        raise RuntimeError(f"episode {i}: no demonstration of {self.behaviors[i]!r} in {MAX_ATTEMPTS} attempts")
+        raise RuntimeError(
+            f"episode {i}: no demonstration of {self.behaviors[i]!r} in {MAX_ATTEMPTS} attempts"
+        )
 
 
 def _shuffled(counts: Sequence[tuple[str, int]], seed: int) -> tuple[str, ...]:

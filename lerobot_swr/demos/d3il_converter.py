@@ -101,7 +101,9 @@ def convert_recording(path: Path, task: str) -> Demonstration:
     actions = np.diff(desired, axis=0)
     largest = float(np.abs(actions).max())
     if largest > ACTION_LIMIT_M:
-        logging.warning("%s: an action of %.3f m; the environment clips at %.3f m", path, largest, ACTION_LIMIT_M)
+        logging.warning(
+            "%s: an action of %.3f m; the environment clips at %.3f m", path, largest, ACTION_LIMIT_M
+        )
     return Demonstration(
         {
             "observation.state": np.concatenate([desired, actual], axis=1)[:-1].astype(np.float32),

@@ -44,7 +44,10 @@ def write_dataset(
     for leftover in work_dir.glob("building-*"):
         shutil.rmtree(leftover)  # of a run that was killed
     histogram: Counter[str] = Counter()
-    with _removed_if_useless(work_dir), tempfile.TemporaryDirectory(prefix="building-", dir=work_dir) as workspace:
+    with (
+        _removed_if_useless(work_dir),
+        tempfile.TemporaryDirectory(prefix="building-", dir=work_dir) as workspace,
+    ):
         dataset = LeRobotDataset.create(
             repo_id=repo_id or f"local/{recipe.name}",
             fps=recipe.fps,
@@ -57,16 +60,21 @@ def write_dataset(
             use_videos=False,
         )
         disable_progress_bars()  # those of `datasets`, one per episode
-        for demonstration in tqdm(
-            recipe.demonstrations(seed, work_dir / "episodes"), total=recipe.n_episodes, desc=recipe.name, unit="episode"
-        ):
-            columns = {**demonstration.observations, "action": demonstration.actions}
-            for t in range(len(demonstration.actions)):
-                frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
-                dataset.add_frame({**frame, "task": recipe.instruction})
-            dataset.save_episode()
-            histogram[recipe.behavior_rule(demonstration.observations)] += 1
-        dataset.finalize()
+        try:
+            for demonstration in tqdm(
+                recipe.demonstrations(seed, work_dir / "episodes"),
+                total=recipe.n_episodes,
+                desc=recipe.name,
+                unit="episode",
+            ):
+                columns = {**demonstration.observations, "action": demonstration.actions}
+                for t in range(len(demonstration.actions)):
+                    frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
+                    dataset.add_frame({**frame, "task": recipe.instruction})
+                dataset.save_episode()
+                histogram[recipe.behavior_rule(demonstration.observations)] += 1
+        finally:
+            dataset.finalize()  # after an error too: its destructor would write into the removed folder
         _sort_statistics(Path(workspace) / "dataset" / "meta" / "stats.json")
         if root.exists():
             shutil.rmtree(root)

@@ -15,7 +15,9 @@ Job = Callable[[int], Demonstration]
 """Makes episode number i; all of its randomness comes from i and what the job holds. Must be picklable."""
 
 
-def generate(job: Job, n_episodes: int, work_dir: Path, n_workers: int | None = None) -> Iterator[Demonstration]:
+def generate(
+    job: Job, n_episodes: int, work_dir: Path, n_workers: int | None = None
+) -> Iterator[Demonstration]:
     """The episodes 0 to n - 1, in order.
 
     Every finished episode is kept as a file in `work_dir`, which a later run with the same job continues from. As
@@ -66,7 +68,9 @@ def save_episode(path: Path, episode: Demonstration) -> None:
     """Write an episode so that the file is either complete or not there."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with temporary.open("wb") as file:
-        np.savez(file, **{f"observations/{k}": v for k, v in episode.observations.items()}, actions=episode.actions)
+        np.savez(
+            file, **{f"observations/{k}": v for k, v in episode.observations.items()}, actions=episode.actions
+        )
     temporary.replace(path)
 
 

@@ -136,6 +136,8 @@ def _with_arrays(value: Any) -> Any:
         return {key: _with_arrays(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return type(value)(_with_arrays(item) for item in value)
-    if value is None or isinstance(value, bool | int | float | str | bytes | bytearray | np.ndarray | np.generic):
+    if value is None or isinstance(
+        value, bool | int | float | str | bytes | bytearray | np.ndarray | np.generic
+    ):
         return value
     raise UnsafePickleError(f"an object of type {type(value).__name__}")
