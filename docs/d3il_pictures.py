@@ -15,7 +15,7 @@ from lerobot_swr.envs.d3il.avoiding import AvoidingEnv
 
 IMAGES = Path(__file__).parent / "images"
 FRAMES = 4
-HEIGHT, WIDTH = 300, 400
+HEIGHT, WIDTH = 240, 320
 
 
 def angle(quaternion: np.ndarray) -> float:
@@ -45,8 +45,8 @@ def strip(env: ArmTask, demonstration: Demonstration, options: Mapping[str, list
 
 
 def save(name: str, *strips: np.ndarray) -> None:
-    """Write strips below each other as a small palette PNG."""
-    picture = Image.fromarray(np.concatenate(strips, axis=0)).quantize(128, dither=Image.Dither.NONE)
+    """Write strips below each other as a PNG."""
+    picture = Image.fromarray(np.concatenate(strips, axis=0))
     IMAGES.mkdir(exist_ok=True)
     picture.save(IMAGES / name, optimize=True)
     print(IMAGES / name, (IMAGES / name).stat().st_size // 1000, "kB")

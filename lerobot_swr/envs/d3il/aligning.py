@@ -106,9 +106,7 @@ class AligningEnv(ArmTask):
         box = _given_pose(options, "box") or _draw_pose(self.np_random, BOX_POSITION_RANGE)
         target = _given_pose(options, "target") or _draw_pose(self.np_random, TARGET_POSITION_RANGE)
         self._target[:] = target.pose
-        self._simulation.reset(np.concatenate([_START_ARM, box.pose]))
-        self._simulation.data.mocap_pos[0] = self._target[:3]
-        self._simulation.data.mocap_quat[0] = self._target[3:]
+        self._simulation.reset(np.concatenate([_START_ARM, box.pose]), marker=self._target)
 
     def _scene_state(self) -> np.ndarray:
         return np.concatenate([self._box, self._target]).astype(np.float32)
@@ -162,7 +160,7 @@ def _draw_pose(
 @lru_cache(maxsize=1)
 def aligning_model() -> "mujoco.MjModel":
     """The compiled scene, shared by all environments of this process (nothing writes to it)."""
-    spec = new_scene(camera_position=(1.35, 0.05, 0.85), camera_target=(0.47, 0.03, 0.08))
+    spec = new_scene(camera_position=(1.4, 0.02, 0.85), camera_target=(0.46, 0.02, 0.14))
     box = spec.worldbody.add_body(name="box")
     box.add_freejoint(name="box")
     target = spec.worldbody.add_body(name="target", mocap=True)

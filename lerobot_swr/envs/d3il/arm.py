@@ -142,7 +142,7 @@ VISUAL_SHAPES = (
 
 _LIGHT_SHELL = (0.93, 0.94, 0.95, 1.0)
 _DARK_SHELL = (0.30, 0.32, 0.35, 1.0)
-_ROD_COLOUR = (0.95, 0.45, 0.05, 1.0)
+_ROD_COLOUR = (0.98, 0.80, 0.05, 1.0)
 
 
 def add_arm(spec: "mujoco.MjSpec") -> None:

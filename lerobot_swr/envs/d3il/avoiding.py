@@ -107,7 +107,7 @@ class AvoidingEnv(ArmTask):
 @lru_cache(maxsize=1)
 def avoiding_model() -> "mujoco.MjModel":
     """The compiled scene, shared by all environments of this process (nothing writes to it)."""
-    spec = new_scene(camera_position=(1.45, 0.03, 0.95), camera_target=(0.45, 0.03, 0.1))
+    spec = new_scene(camera_position=(1.4, 0.06, 0.9), camera_target=(0.44, 0.06, 0.14))
     for obstacle in OBSTACLES:
         spec.worldbody.add_geom(
             name=obstacle.name,

@@ -70,5 +70,5 @@ def _add_light_and_camera(
         pos=camera_position,
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
         targetbody=target.name,
-        fovy=40.0,
+        fovy=36.0,
     )

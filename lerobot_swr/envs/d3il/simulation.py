@@ -29,10 +29,17 @@ class ArmSimulation:
         self._tool = self.data.site(TOOL_SITE).xpos
         self._planned_joints = np.zeros(N_ARM_JOINTS)
 
-    def reset(self, qpos: np.ndarray) -> None:
-        """Start at rest in `qpos` (n_q,), then let one millisecond pass under gravity compensation alone."""
+    def reset(self, qpos: np.ndarray, marker: np.ndarray | None = None) -> None:
+        """Start at rest, then let one millisecond pass under gravity compensation alone.
+
+        Args:
+            qpos: (n_q,) joint positions.
+            marker: (7,) pose of the scene's mocap body, if it has one: position and quaternion.
+        """
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:] = qpos
+        if marker is not None:
+            self.data.mocap_pos[0], self.data.mocap_quat[0] = marker[:3], marker[3:]
         mujoco.mj_forward(self.model, self.data)
         self._ctrl[:N_ARM_JOINTS] = self._bias[:N_ARM_JOINTS]
         self._ctrl[N_ARM_JOINTS:] = _FINGER_FORCE_AT_RESET
