@@ -41,7 +41,8 @@ def benchmark_bits(path):
 def test_mode_bits_equal_the_benchmarks(seed):
     """On random walks towards the finish line, the bits equal the benchmark's."""
     rng = np.random.default_rng(seed)
-    path = np.cumsum(rng.normal([0.0, 0.008], [0.02, 0.01], size=(90, 2)), axis=0) + [0.525, -0.28]
+    path = np.cumsum(rng.normal([0.0, 0.008], [0.02, 0.01], size=(90, 2)), axis=0)
+    path += [0.525, -0.28]
     gaps: Gaps = (None, None, None)
     for point in path:
         gaps = gaps_after(gaps, point)
@@ -57,12 +58,13 @@ def test_there_are_24_behaviors():
 
 
 def avoiding(path):
+    """Label of a path of the actual position; the desired one is elsewhere."""
     path = np.array(path, dtype=np.float32)
     return avoiding_behavior({"observation.state": np.concatenate([path + 9, path], axis=1)})
 
 
 def test_avoiding_failures_have_their_own_labels():
-    """An episode that ends at an obstacle is a collision, any other that does not cross the line is unfinished."""
+    """Ending at an obstacle is a collision, any other episode that does not cross the line is unfinished."""
     assert avoiding([(0.52, -0.28), (0.51, -0.14)]) == "collision"
     assert avoiding([(0.52, -0.28), (0.6, -0.1), (0.6, 0.0)]) == "unfinished"
 
@@ -74,10 +76,12 @@ def test_avoiding_reads_the_actual_position():
 
 
 def pose(x, y, angle, z=0.0):
+    """Position and quaternion of a turn about the vertical."""
     return [x, y, z, math.cos(angle / 2), 0, 0, math.sin(angle / 2)]
 
 
 def aligning(boxes, tools, target):
+    """Label of an episode of box poses and tool positions."""
     scene = np.array([[*box, *target] for box in boxes], dtype=np.float32)
     state = np.array([[0, 0, 0, *tool] for tool in tools], dtype=np.float32)
     return aligning_behavior({"observation.state": state, "observation.environment_state": scene})

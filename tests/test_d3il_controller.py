@@ -15,6 +15,7 @@ JOINT_HIGH = np.array([2.8, 1.7, 2.0, -0.1, 2.8, 3.7, 2.8])
 
 
 def kinematics(joints):
+    """Position, rotation and Jacobian of the tool."""
     position, rotation, jacobian = np.empty(3), np.empty((3, 3)), np.empty((6, 7))
     tool_kinematics(joints, position, rotation, jacobian)
     return position, rotation, jacobian

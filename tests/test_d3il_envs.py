@@ -150,7 +150,7 @@ def go_to(waypoints, speed=0.008):
 
 
 def test_avoiding_success_and_mode():
-    """Below the first obstacle, through the middle of level 2, past the upper end of level 3: bits 1, 3 and 5."""
+    """Below the first obstacle, through the middle of level 2, above level 3: bits 1, 3 and 5."""
     path = [(0.6, -0.1), (0.5, 0.04), (0.46, 0.12), (0.28, 0.24), (0.28, 0.42)]
     observations, (reward, terminated, _, info) = episode(AvoidingEnv(), go_to(path), seed=0)
     assert terminated
@@ -254,7 +254,7 @@ except ModuleNotFoundError as error:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_pictures(task):
-    """`render` gives a picture with many colours in which something moves; it costs nothing where not asked for."""
+    """`render` gives a picture with many colours in which something moves."""
     cfg = make_env_config("d3il", task=task, render_height=120, render_width=160)
     env = gym.make(cfg.gym_id, **cfg.gym_kwargs)
     env.reset(seed=0)

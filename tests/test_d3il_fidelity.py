@@ -21,6 +21,7 @@ REFERENCE = (
 
 
 def load(name: str) -> dict[str, np.ndarray]:
+    """The arrays of one reference file; skips the test if it is absent."""
     path = REFERENCE / name
     if not path.is_file():
         pytest.skip(f"reference traces {path} not found; set LEROBOT_SWR_REFERENCE to the folder above them")
@@ -30,6 +31,8 @@ def load(name: str) -> dict[str, np.ndarray]:
 
 @dataclass
 class AvoidingReplay:
+    """Our consequences of one reference episode's actions."""
+
     name: str
     position_error: np.ndarray  # (T,) m
     touched: bool  # any contact in any millisecond of the reference
@@ -40,14 +43,15 @@ class AvoidingReplay:
 
 @pytest.fixture(scope="module")
 def avoiding_replays() -> list[AvoidingReplay]:
+    """All avoiding episodes, replayed."""
     reference = load("avoiding_dev.npz")
     env = AvoidingEnv()
     replays = []
     for episode, n_steps in enumerate(reference["steps"]):
         env.reset(seed=0)
         errors, success, collision = [], False, False
-        # To the end of the reference, which runs one step longer: the benchmark says "done" one step late, and
-        # in that step its mode bits may still change.
+        # To the end of the reference, which runs one step longer: the benchmark says "done" one step late,
+        # and in that step its mode bits may still change.
         for t in range(n_steps):
             _, _, _, _, info = env.step(reference["actions"][episode, t])
             ours = env._simulation.tool_position
@@ -91,6 +95,8 @@ def test_avoiding_outcomes(avoiding_replays):
 
 @dataclass
 class AligningReplay:
+    """Our consequences of one reference episode's actions."""
+
     name: str
     tool_error: np.ndarray  # (T,) m
     first_contact: int | None  # step of the first rod-box contact in the reference
@@ -102,6 +108,7 @@ class AligningReplay:
 
 @pytest.fixture(scope="module")
 def aligning_replays() -> list[AligningReplay]:
+    """All aligning episodes, replayed."""
     reference = load("aligning_dev.npz")
     env = AligningEnv()
     replays = []
@@ -155,7 +162,7 @@ def test_aligning_mode_and_success(aligning_replays):
 
 
 def test_aligning_box_after_contact(aligning_replays):
-    """In at least 80 % of the episodes with contact the box ends within 2 cm and 10 degrees of the benchmark's."""
+    """In 80 % of the episodes with contact the box ends within 2 cm and 10 degrees of the benchmark's."""
     pushed = [replay for replay in aligning_replays if replay.first_contact is not None]
     close = [replay for replay in pushed if replay.box_error <= 0.02 and replay.box_angle_error <= 10]
     assert len(pushed) >= 12
@@ -163,6 +170,6 @@ def test_aligning_box_after_contact(aligning_replays):
 
 
 def test_aligning_most_pushes_are_exact(aligning_replays):
-    """Most pushes are reproduced to a micrometre: contacts are resolved as in the benchmark, not just similarly."""
+    """Most pushes are reproduced to a micrometre: contacts are resolved as in the benchmark."""
     pushed = [replay for replay in aligning_replays if replay.first_contact is not None]
     assert np.median([replay.box_error for replay in pushed]) <= 1e-6

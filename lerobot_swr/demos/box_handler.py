@@ -1,7 +1,8 @@
-"""A scripted hand for the aligning task: flies to the box, lowers the rod, finds contact and steers the box home.
+"""A scripted hand for the aligning task: flies to the box, lowers the rod, makes contact, steers it home.
 
 It acts on observations alone. The arm lags behind its set-point by several steps, so the hand integrates the
-desired position and leads the actual one just enough to overcome the box's friction; a fixed lead would oscillate.
+desired position and leads the actual one just enough to overcome the box's friction; a fixed lead would
+oscillate.
 """
 
 import enum

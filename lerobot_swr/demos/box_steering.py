@@ -1,12 +1,12 @@
 """Steering a box over a table with a rod: pushing it from behind, or pulling it from inside.
 
-Both are the same problem as parking a trailer. Sliding slowly, the box obeys a limit surface: a force (f1, f2) at
-the contact point makes it move along the force and turn by the moment over a *compliance*. So the contact point's
-velocity in the box's heading frame decides the curvature of the path of a *pivot* on the heading axis, and a
-pose-stabilising law for that pivot brings the box to its target pose.
+Both are the same problem as parking a trailer. Sliding slowly, the box obeys a limit surface: a force (f1,
+f2) at the contact point makes it move along the force and turn by the moment over a *compliance*. So the
+contact point's velocity in the box's heading frame decides the curvature of the path of a *pivot* on the
+heading axis, and a pose-stabilising law for that pivot brings the box to its target pose.
 
-All quantities are in the table's plane; the heading frame has its origin in the box's centre and its first axis
-along the heading, the direction in which the box is moved.
+All quantities are in the table's plane; the heading frame has its origin in the box's centre and its first
+axis along the heading, the direction in which the box is moved.
 """
 
 import math
@@ -34,8 +34,8 @@ class Grip:
     """Where the rod touches the box, on the heading axis of the heading frame.
 
     Attributes:
-        inside: Pull from inside a corner (ahead of the centre), which takes force in any forward direction, or push
-            at a face (behind the centre), where friction takes the lateral force.
+        inside: Pull from inside a corner (ahead of the centre), which takes force in any forward direction,
+            or push at a face (behind the centre), where friction takes the lateral force.
         contact: x of the contact point, m.
         above: x over which the rod is lowered, m.
         touching: x of the rod from which it can be taken to touch, m.
@@ -50,7 +50,7 @@ class Grip:
 
     @property
     def pivot(self) -> float:
-        """x of the point that moves along the heading, whatever the curvature."""
+        """Place (x, m) of the point that moves along the heading, whatever the curvature."""
         return -self.compliance / self.contact
 
 
@@ -61,7 +61,13 @@ OUTSIDE_FACE = Grip(inside=False, contact=-0.055, above=-0.088, touching=-0.0665
 
 @dataclass(frozen=True)
 class Gains:
-    """How sharply the pivot is steered: `turn` towards the goal line, `approach` along it, and the smallest radius."""
+    """How sharply the pivot is steered.
+
+    Attributes:
+        turn: How far ahead of the goal line the heading turns.
+        approach: How fast it turns.
+        smallest_distance: Distance (m) below which curvature grows no further.
+    """
 
     turn: float
     approach: float
@@ -95,7 +101,7 @@ def headings(grip: Grip) -> list[float]:
 
 
 def heading_costs(box: PlanePose, target: PlanePose, grip: Grip) -> np.ndarray:
-    """(4,) squared turns that each of `headings` asks for: from its start to the way, and from the way to its end."""
+    """(4,) squared turns that each of `headings` asks for, from its start to the way and then to its end."""
     way = math.atan2(target.y - box.y, target.x - box.x)
     return np.array(
         [wrap(box.angle + psi - way) ** 2 + wrap(target.angle + psi - way) ** 2 for psi in headings(grip)]
@@ -111,8 +117,8 @@ def pivot_curvature(heading: PlanePose, goal: PlanePose, grip: Grip, gains: Gain
         grip: Where the rod touches.
         gains: See `Gains`.
 
-    Source: Park and Kuipers, "A smooth control law for graceful motion of differential wheeled mobile robots",
-    ICRA 2011; within 5 cm of the goal, a linear law on its goal line.
+    Source: Park and Kuipers, "A smooth control law for graceful motion of differential wheeled mobile
+    robots", ICRA 2011; within 5 cm of the goal, a linear law on its goal line.
     """
     pivot = heading.position + grip.pivot * direction(heading.angle)
     pivot_goal = goal.position + grip.pivot * direction(goal.angle)
@@ -130,7 +136,7 @@ def pivot_curvature(heading: PlanePose, goal: PlanePose, grip: Grip, gains: Gain
 
 
 def rod_directions(curvature: float, rod_y: float, grip: Grip) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity and force of the rod, both (2,) unit vectors in the heading frame, that give the box a curvature.
+    """Velocity and force of the rod, (2,) unit vectors in the heading frame, that give the box a curvature.
 
     Args:
         curvature: Wanted curvature of the pivot's path, 1/m.

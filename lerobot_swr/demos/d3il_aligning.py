@@ -1,8 +1,8 @@
 """Scripted demonstrators of the D3IL aligning task, and their datasets.
 
-Contexts (poses of box and target) are drawn uniformly; in each, a hand with drawn habits tries to bring the box
-home in the intended way. An attempt that fails is thrown away and other habits are tried; in the rare context that
-defeats `MAX_ATTEMPTS` habits, another context is drawn.
+Contexts (poses of box and target) are drawn uniformly; in each, a hand with drawn habits tries to bring the
+box home in the intended way. An attempt that fails is thrown away and other habits are tried; in the rare
+context that defeats `MAX_ATTEMPTS` habits, another context is drawn.
 """
 
 from dataclasses import dataclass
@@ -39,7 +39,8 @@ def draw_habits(inside: bool, attempt: int, rng: np.random.Generator) -> Habits:
         ),
         pace=rng.uniform(0.85, 1.05),
         flying_z=rng.uniform(0.232, 0.245),
-        # Deep inside, a tilted rod stays clearly closer to the box's centre than the 51 mm that count as inside.
+        # Deep inside, a tilted rod stays clearly closer to the box's centre than the 51 mm that count as
+        # inside.
         working_z=rng.uniform(0.127, 0.135) if inside else rng.uniform(0.14, 0.158),
         pause=int(rng.choice([0, 0, 0, rng.integers(3, 12)])),
         tremor=rng.uniform(0.0001, 0.0003),

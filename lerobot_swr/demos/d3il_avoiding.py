@@ -1,8 +1,9 @@
 """Scripted demonstrators of the D3IL avoiding task: human-like ways through given gaps, and their datasets.
 
-A demonstration leads the desired tool position along a smooth path through free points and through points inside
-its gaps, at a varying speed with slow-downs before gaps and a little hand tremor, in the real simulation. All
-constants were fixed before any policy was trained on the datasets; lengths are in metres, times in steps.
+A demonstration leads the desired tool position along a smooth path through free points and through points
+inside its gaps, at a varying speed with slow-downs before gaps and a little hand tremor, in the real
+simulation. All constants were fixed before any policy was trained on the datasets; lengths are in metres,
+times in steps.
 """
 
 from collections.abc import Sequence
@@ -163,8 +164,8 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
 
 BALANCED = dict.fromkeys(AVOIDING_BEHAVIORS, 4)
 
-# Skewed like everyday habits: three ways make a third of the demonstrations, five are shown only once. The k-th
-# count belongs to behaviour 7 k mod 24, so that frequent ways are not neighbours.
+# Skewed like everyday habits: three ways make a third of the demonstrations, five are shown only once. The
+# k-th count belongs to behaviour 7 k mod 24, so that frequent ways are not neighbours.
 _SKEWED_COUNTS = (14, 11, 9, 8, 7, 6, 5, 4, 4, 3, 3, 3, 2, 2, 2, 2, 2, 2, 2, 1, 1, 1, 1, 1)
 UNBALANCED = {AVOIDING_BEHAVIORS[7 * k % 24]: count for k, count in enumerate(_SKEWED_COUNTS)}
 

@@ -1,9 +1,9 @@
 """Turns the D3IL benchmark's own recordings into datasets like those of the scripted demonstrators.
 
-A recording is a pickled dictionary of arrays over T states: ``robot`` with the desired and the actual tool position
-``des_c_pos`` and ``c_pos`` (T, 3), and for aligning ``push-box`` and ``target-box`` with ``pos`` (T, 3) and ``quat``
-(T, 4, w first). As in the benchmark (Jia et al., ICLR 2024), observations are the states without the last one, and
-actions the differences of the desired position.
+A recording is a pickled dictionary of arrays over T states: ``robot`` with the desired and the actual tool
+position ``des_c_pos`` and ``c_pos`` (T, 3), and for aligning ``push-box`` and ``target-box`` with ``pos`` (T,
+3) and ``quat`` (T, 4, w first). As in the benchmark (Jia et al., ICLR 2024), observations are the states
+without the last one, and actions the differences of the desired position.
 """
 
 import logging
@@ -29,8 +29,8 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
     Args:
         folder: Holds the recordings, ``*.pkl``, directly or in subfolders.
         task: ``avoiding`` or ``aligning``.
-        file_list: A pickled list of file names in `folder` (the benchmark's train or evaluation split); by default
-            all recordings, sorted by name.
+        file_list: A pickled list of file names in `folder` (the benchmark's train or evaluation split); by
+            default all recordings, sorted by name.
 
     Raises:
         ValueError: If the task is unknown, there is no recording, or the file list cannot be read.
@@ -78,7 +78,8 @@ def convert_recording(path: Path, task: str) -> Demonstration:
     """Read one recording.
 
     Raises:
-        ValueError: Naming the file and the key, if a key is missing or its array has a wrong shape or is not finite.
+        ValueError: Naming the file and the key, if a key is missing or its array has a wrong shape or is not
+            finite.
     """
     recording = load_recording(path)
     desired = _array(path, recording, "robot", "des_c_pos", 3)

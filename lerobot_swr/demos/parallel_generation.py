@@ -20,8 +20,9 @@ def generate(
 ) -> Iterator[Demonstration]:
     """The episodes 0 to n - 1, in order.
 
-    Every finished episode is kept as a file in `work_dir`, which a later run with the same job continues from. As
-    each episode depends on its number alone, the result depends neither on interruptions nor on `n_workers`.
+    Every finished episode is kept as a file in `work_dir`, which a later run with the same job continues
+    from. As each episode depends on its number alone, the result depends neither on interruptions nor on
+    `n_workers`.
 
     Args:
         job: Makes one episode.
@@ -36,8 +37,11 @@ def generate(
         for i in range(n_episodes):
             yield _made(job, i, work_dir)
         return
-    # Not forked: a fork of a process that has started threads (torch, numba) may hang.
-    pool = ProcessPoolExecutor(min(n_workers, len(missing)), mp_context=get_context("forkserver"))
+    # Not forked: a fork of a process that has started threads (torch, numba) may hang. The server imports the
+    # job's module once for all workers.
+    context = get_context("forkserver")
+    context.set_forkserver_preload([type(job).__module__])
+    pool = ProcessPoolExecutor(min(n_workers, len(missing)), mp_context=context)
     try:
         pending: dict[int, Future[None]] = {i: pool.submit(_make, job, i, work_dir) for i in missing}
         for i in range(n_episodes):

@@ -1,8 +1,8 @@
 """Reads pickled recordings without running anything that a pickle could ask for.
 
-A pickle is a program. Here it can build nothing but plain containers, numbers, strings and numpy arrays, under the
-names of numpy 1 and 2 alike. Even the arrays are built by this module from their recorded bytes, so that numpy's
-own unpickling code never sees a hostile state.
+A pickle is a program. Here it can build nothing but plain containers, numbers, strings and numpy arrays,
+under the names of numpy 1 and 2 alike. Even the arrays are built by this module from their recorded bytes, so
+that numpy's own unpickling code never sees a hostile state.
 """
 
 import io
@@ -35,7 +35,8 @@ def load_recording(path: Path) -> Any:
         return _with_arrays(loaded)
     except UnsafePickleError as error:
         raise UnsafePickleError(
-            f"{path}: refused, it asks for {error}; recordings may hold numpy arrays and plain containers only"
+            f"{path}: refused, it asks for {error}; recordings may hold numpy arrays and plain containers
+            only"
         ) from error
     except OSError:
         raise

@@ -31,8 +31,8 @@ class ThreadVectorEnv(SyncVectorEnv):
     """`SyncVectorEnv`, with the steps of its sub-environments taken by one thread per core.
 
     It behaves identically: everything but the steps themselves is `SyncVectorEnv`'s own code. It pays for
-    environments that release Python's global lock while they step, as MuJoCo and numba do, and saves the worker
-    processes and copies of `AsyncVectorEnv`.
+    environments that release Python's global lock while they step, as MuJoCo and numba do, and saves the
+    worker processes and copies of `AsyncVectorEnv`.
 
     Args:
         env_fns: Make the sub-environments, whose steps must not share anything that changes.

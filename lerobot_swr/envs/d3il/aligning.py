@@ -66,12 +66,13 @@ class AligningEnv(ArmTask):
     | `environment_state` | 0-6 | box position and quaternion |
     | | 7-13 | target position and quaternion |
 
-    **Action** (3): change of the desired tool x, y, z in metres per step, clipped to +-0.05; one step is 35 ms. The
-    rod's tip is 0.12 m below the tool: it enters the box below z = 0.204 and touches its floor at z = 0.121.
+    **Action** (3): change of the desired tool x, y, z in metres per step, clipped to +-0.05; one step is 35
+    ms. The rod's tip is 0.12 m below the tool: it enters the box below z = 0.204 and touches its floor at z =
+    0.121.
 
-    **Start**: the arm always at (0.525, -0.349, 0.252). Box and target are drawn uniformly from the seed: box x 0.4
-    to 0.6, y -0.25 to -0.1, target x 0.4 to 0.6, y 0.2 to 0.35, both angles -90 to 90 degrees; or given by
-    `reset(options={"box": [x, y, angle_rad], "target": [x, y, angle_rad]})`, either or both.
+    **Start**: the arm always at (0.525, -0.349, 0.252). Box and target are drawn uniformly from the seed: box
+    x 0.4 to 0.6, y -0.25 to -0.1, target x 0.4 to 0.6, y 0.2 to 0.35, both angles -90 to 90 degrees; or given
+    by `reset(options={"box": [x, y, angle_rad], "target": [x, y, angle_rad]})`, either or both.
 
     **Reward**: -3.5 |box - target| - rotation distance / pi.
 

@@ -1,8 +1,8 @@
 """The arm of the D3IL tasks as MuJoCo bodies: a Franka Panda whose hand holds a vertical rod.
 
-Frames, masses, inertias and joints are measurements of the benchmark's compiled model (Jia et al., ICLR 2024);
-they decide how far the arm lags behind its set-point, which a policy feels. The visible shapes are our own, have
-no mass and touch nothing; only the rod can touch things.
+Frames, masses, inertias and joints are measurements of the benchmark's compiled model (Jia et al., ICLR
+2024); they decide how far the arm lags behind its set-point, which a policy feels. The visible shapes are our
+own, have no mass and touch nothing; only the rod can touch things.
 """
 
 from typing import Literal, NamedTuple
@@ -38,7 +38,7 @@ class Joint(NamedTuple):
 
 
 class ArmBody(NamedTuple):
-    """A body: frame in its parent, mass (kg), and principal moments of inertia (kg m^2) in an inertial frame."""
+    """A body: frame in its parent, mass (kg), principal moments (kg m^2) in an inertial frame."""
 
     name: str
     parent: str

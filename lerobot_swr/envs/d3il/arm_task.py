@@ -65,7 +65,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Put the arm into its start pose and begin an episode; see the class for what `seed` and `options` do."""
+        """Put the arm into its start pose and begin an episode; the class says what the arguments do."""
         super().reset(seed=seed)
         self._desired = self._start_tool.copy()
         self._begin_episode(options or {})

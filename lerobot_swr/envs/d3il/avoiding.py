@@ -34,17 +34,18 @@ class AvoidingEnv(ArmTask):
     | `environment_state` | 0-17 | x, y, radius of the six obstacles, by level and x |
     | | 18 | y of the finish line |
 
-    **Action** (2): change of the desired tool x, y in metres per step, clipped to +-0.05. The desired height stays
-    0.122 m. One step is 35 ms; demonstrations move 5 to 9 mm per step.
+    **Action** (2): change of the desired tool x, y in metres per step, clipped to +-0.05. The desired height
+    stays 0.122 m. One step is 35 ms; demonstrations move 5 to 9 mm per step.
 
     **Start**: always the same pose, tool at (0.525, -0.280); `seed` and `options` change nothing.
 
     **Reward**: 1 on reaching the finish line, else 0.
 
-    **End**: terminates when the tool crosses y = 0.35 (success) or the rod touches an obstacle at the end of a
-    step (a contact that is over by then goes unnoticed, as in the benchmark). Truncated after 250 steps.
+    **End**: terminates when the tool crosses y = 0.35 (success) or the rod touches an obstacle at the end of
+    a step (a contact that is over by then goes unnoticed, as in the benchmark). Truncated after 250 steps.
 
-    **Info**: `is_success`; `collision`; `mode`, (9,) int8, one bit per gap taken (2 + 3 + 4, from small to large x).
+    **Info**: `is_success`; `collision`; `mode`, (9,) int8, one bit per gap taken (2 + 3 + 4, from small to
+    large x).
 
     **Behaviour**: `lerobot_swr.envs.d3il.behavior.avoiding_behavior`.
 

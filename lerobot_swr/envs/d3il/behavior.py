@@ -1,8 +1,8 @@
-"""Which behaviour an episode of a D3IL task shows: pure functions of its observed states, without a simulator.
+"""Which behaviour an episode of a D3IL task shows: pure functions of its states, without a simulator.
 
 The same functions label demonstrations, rollouts and converted recordings, and the environments judge their
-states with them. The keys are LeRobot's: ``observation.state`` (T, 4) or (T, 6) holds the desired and then the
-actual tool position, ``observation.environment_state`` the scene.
+states with them. The keys are LeRobot's: ``observation.state`` (T, 4) or (T, 6) holds the desired and then
+the actual tool position, ``observation.environment_state`` the scene.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ INSIDE, OUTSIDE = "inside", "outside"
 NOT_ALIGNED = "not_aligned"
 
 GAP_NAMES = (("top", "bottom"), ("top", "mid", "bottom"), ("top", "midtop", "midbottom", "bottom"))
-"""Names of the gaps at each level, from small to large x; small x (the robot's side) is at the top of pictures."""
+"""Names of the gaps at each level, from small to large x; pictures show small x (the robot's side) at the top."""
 
 AVOIDING_BEHAVIORS = tuple(f"{a}-{b}-{c}" for a in GAP_NAMES[0] for b in GAP_NAMES[1] for c in GAP_NAMES[2])
 """The 24 ways through the three levels."""
@@ -82,8 +82,8 @@ def avoiding_behavior(observations: Mapping[str, np.ndarray]) -> str:
         observations: ``observation.state`` (T, 4): desired xy, actual xy in metres.
 
     Returns:
-        One of `AVOIDING_BEHAVIORS` (level names joined by "-", "none" for a level that was jumped over) if the
-        tool crossed the finish line; else ``"collision"`` if the last state touches an obstacle, else
+        One of `AVOIDING_BEHAVIORS` (level names joined by "-", "none" for a level that was jumped over) if
+        the tool crossed the finish line; else ``"collision"`` if the last state touches an obstacle, else
         ``"unfinished"``.
     """
     path = np.asarray(observations["observation.state"])[:, 2:4]
@@ -111,8 +111,8 @@ def is_aligned(environment_state: np.ndarray) -> np.ndarray:
         environment_state: (..., 14): box position and quaternion, target position and quaternion.
 
     Returns:
-        (...,) bool: position within 18 mm (in 3-D; the box rests 9.2 mm below the target's height) and rotation
-        within 8.64 degrees.
+        (...,) bool: position within 18 mm (in 3-D; the box rests 9.2 mm below the target's height) and
+        rotation within 8.64 degrees.
     """
     state = np.asarray(environment_state, np.float64)
     distance = np.linalg.norm(state[..., 0:3] - state[..., 7:10], axis=-1)
@@ -121,7 +121,7 @@ def is_aligned(environment_state: np.ndarray) -> np.ndarray:
 
 
 def is_inside(tool_position: np.ndarray, box_position: np.ndarray) -> np.ndarray:
-    """(...,) bool: whether the tool (..., >= 2) is closer to the box's centre than its walls, in the plane."""
+    """(...,) bool: whether the tool (..., >= 2) is closer to the box's centre than its walls."""
     offset = np.asarray(tool_position, np.float64)[..., :2] - np.asarray(box_position, np.float64)[..., :2]
     return np.linalg.norm(offset, axis=-1) < INSIDE_DISTANCE
 
@@ -134,8 +134,8 @@ def aligning_behavior(observations: Mapping[str, np.ndarray]) -> str:
             (T, 14): box position and quaternion (wxyz), target position and quaternion.
 
     Returns:
-        ``"inside"`` or ``"outside"``, judged at the last state, if the box reached its target at any state (an
-        environment ends there; recordings may run on); else ``"not_aligned"``.
+        ``"inside"`` or ``"outside"``, judged at the last state, if the box reached its target at any state
+        (an environment ends there; recordings may run on); else ``"not_aligned"``.
     """
     scene = np.asarray(observations["observation.environment_state"])
     if not is_aligned(scene).any():

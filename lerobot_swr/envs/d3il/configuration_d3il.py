@@ -118,7 +118,7 @@ class D3ILEnvConfig(TaskEnvConfig):
         return observations[OBS_ENV_STATE][:, [1, 0]]
 
     def draw_scene(self, axes: Axes) -> None:
-        """Obstacles and finish line, or the areas where box and target start; small x (the robot) at the top."""
+        """Obstacles and finish line, or the areas where box and target start; the robot is at the top."""
         if self.task == "avoiding":
             for obstacle in OBSTACLES:
                 axes.add_patch(Circle((obstacle.y, obstacle.x), obstacle.radius, color="tab:red"))

@@ -1,9 +1,9 @@
-"""The arm's controller, once per millisecond: inverse kinematics, joint PD and finger forces, compiled by numba.
+"""The arm's controller, once per millisecond: inverse kinematics, joint PD, finger forces; compiled.
 
-It is the benchmark's controller (Jia et al., ICLR 2024; gains from its published configuration), rewritten from
-its equations. The inverse kinematics integrates its own last result, open loop; the low PD gains let the measured
-tool lag behind the desired one by about a centimetre, which is part of the task. A coarser control period loses
-this behaviour and gains no speed: an inverse-kinematics update costs less than a physics step.
+It is the benchmark's controller (Jia et al., ICLR 2024; gains from its published configuration), rewritten
+from its equations. The inverse kinematics integrates its own last result, open loop; the low PD gains let the measured
+tool lag behind the desired one by about a centimetre, which is part of the task. A coarser control period
+loses this behaviour and gains no speed: an inverse-kinematics update costs less than a physics step.
 
 All functions live in one module because numba's on-disk cache notices changes in the caller's file only.
 """
@@ -218,8 +218,9 @@ def _jacobi_solve(matrix: np.ndarray, vector: np.ndarray) -> None:
 def clipped_solve(matrix: np.ndarray, vector: np.ndarray) -> None:
     """Overwrite `vector` (6,) with V diag(1 / clip(s)) V^T vector, where V diag(s) V^T is `matrix`.
 
-    Where no singular value is below the limit (a Cholesky factor of the matrix minus the limit exists, and its
-    trace keeps it far from the upper limit), clipping changes nothing and a plain solve is the same and faster.
+    Where no singular value is below the limit (a Cholesky factor of the matrix minus the limit exists, and
+    its trace keeps it far from the upper limit), clipping changes nothing and a plain solve is the same and
+    faster.
     """
     trace = 0.0
     for i in range(6):
@@ -282,7 +283,8 @@ def control(
         planned_joints: (7,) result of the last inverse kinematics in rad, updated in place.
         qpos: (>= 9,) measured joint positions, arm then fingers.
         qvel: (>= 9,) measured joint velocities.
-        bias: (>= 7,) gravity and Coriolis forces, as the last physics step left them; the arm's are compensated.
+        bias: (>= 7,) gravity and Coriolis forces, as the last physics step left them; the arm's are
+            compensated.
         ctrl: (9,) output in N m and N.
     """
     previous = planned_joints.copy()

@@ -1,4 +1,4 @@
-"""MuJoCo and numba, which only the D3IL tasks need: imported here, so that a missing one is explained once."""
+"""MuJoCo and numba, which only the D3IL tasks need: imported here, to explain once if one is missing."""
 
 try:
     import mujoco

@@ -1,7 +1,7 @@
 """Where things stand in the two D3IL tasks and when they are done: numbers only, in metres and radians.
 
-Source: Jia et al., ICLR 2024, and measurements of the running benchmark. The simulator-free behaviour rules and
-the environments both read them here.
+Source: Jia et al., ICLR 2024, and measurements of the running benchmark. The simulator-free behaviour rules
+and the environments both read them here.
 """
 
 from typing import NamedTuple
@@ -52,7 +52,7 @@ AVOIDING_SCENE = np.array(
 )
 """(19,) the ``environment_state`` of avoiding, which never changes."""
 LEVEL_BAND = 0.03
-"""Levels 1 and 2 are judged when the tool first comes this close to their obstacles' y, level 3 when it passes."""
+"""Levels 1 and 2 are judged when the tool is first this close to their obstacles' y, level 3 on passing."""
 
 AVOIDING_START_JOINTS = (
     -0.3564086847191445, 0.4294454540368537, -0.1350105953007747, -2.0546518930206967,
@@ -80,7 +80,7 @@ BOX_POSITION_RANGE = ((0.4, 0.6), (-0.25, -0.1))
 TARGET_POSITION_RANGE = ((0.4, 0.6), (0.2, 0.35))
 ANGLE_RANGE = (-np.pi / 2, np.pi / 2)
 POSITION_TOLERANCE = 0.018
-"""Largest 3-D distance of the box to its target. The box rests 9.2 mm below it, which leaves 15.5 mm in the plane."""
+"""Largest 3-D distance of the box to its target; resting 9.2 mm below it leaves 15.5 mm in the plane."""
 ROTATION_TOLERANCE = 0.048 * np.pi
 """Largest rotation between the box and its target: 8.64 degrees."""
 INSIDE_DISTANCE = 0.051

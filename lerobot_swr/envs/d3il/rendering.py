@@ -43,8 +43,8 @@ class OffscreenCamera:
         mujoco.mjr_resizeOffscreen(width, height, self._context)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self.close = weakref.finalize(self, _free, self._gl, self._context)
-        # At interpreter exit it must run before MuJoCo ends its display connection. That was registered when the
-        # context was opened, and exit handlers run last in, first out; a finalizer's own hook is older.
+        # At interpreter exit it must run before MuJoCo ends its display connection. That was registered when
+        # the context was opened, and exit handlers run last in, first out; a finalizer's own hook is older.
         self.close.atexit = False
         atexit.register(self.close)
 

@@ -30,8 +30,9 @@ def new_scene(
     spec.option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     spec.option.tolerance = 1e-10
     spec.option.iterations = 100
-    # The benchmark's MuJoCo 2.3.2 had only the older convex collision code. With it, nearly all of its box pushes
-    # are reproduced to the last digits; the newer default decides stick and slip differently within ten steps.
+    # The benchmark's MuJoCo 2.3.2 had only the older convex collision code. With it, nearly all of its box
+    # pushes are reproduced to the last digits; the newer default decides stick and slip differently within
+    # ten steps.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_NATIVECCD
     spec.option.gravity = (0.0, 0.0, -9.81)
     add_arm(spec)
