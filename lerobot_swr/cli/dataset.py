@@ -21,8 +21,9 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 class DatasetCommand:
     """Options of ``lerobot-swr-dataset``."""
 
-    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast; d3il_avoiding,
-    # d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning. With from_d3il: avoiding or aligning.
+    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast;
+    # d3il_avoiding, d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning.
+    # With from_d3il: avoiding or aligning.
     task: str
     # Folder of the new dataset.
     root: Path
@@ -32,7 +33,7 @@ class DatasetCommand:
     repo_id: str | None = None
     # Replace a dataset that is already in the folder.
     overwrite: bool = False
-    # Convert the D3IL benchmark's own recordings (*.pkl) in this folder instead of writing scripted demonstrations.
+    # Convert the D3IL benchmark's own recordings (*.pkl) in this folder instead.
     from_d3il: Path | None = None
     # With from_d3il: a pickled list of the file names to convert; default: all of them.
     file_list: Path | None = None

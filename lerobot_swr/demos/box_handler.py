@@ -79,7 +79,7 @@ class BoxHandler:
         self._psi: float | None = None
         self._grips = 0
         self._pause = habits.pause
-        self._noise = np.zeros(3)
+        self._noise: np.ndarray = np.zeros(3)
         self.gave_up = False
 
     def act(self, state: np.ndarray, scene: np.ndarray) -> np.ndarray:

@@ -42,7 +42,7 @@ def draw_habits(inside: bool, attempt: int, rng: np.random.Generator) -> Habits:
         # Deep inside, a tilted rod stays clearly closer to the box's centre than the 51 mm that count as
         # inside.
         working_z=rng.uniform(0.127, 0.135) if inside else rng.uniform(0.14, 0.158),
-        pause=int(rng.choice([0, 0, 0, rng.integers(3, 12)])),
+        pause=int(rng.choice(np.array([0, 0, 0, rng.integers(3, 12)]))),
         tremor=rng.uniform(0.0001, 0.0003),
     )
 
@@ -102,8 +102,8 @@ class AligningJob:
 def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
     behaviors = [behavior for behavior, count in counts.items() for _ in range(count)]
 
-    def shuffled(seed: int) -> tuple[str, ...]:
-        return tuple(str(b) for b in np.random.default_rng(seed).permutation(behaviors))
+    def job(seed: int) -> AligningJob:
+        return AligningJob(tuple(map(str, np.random.default_rng(seed).permutation(behaviors))), seed)
 
     return DatasetRecipe(
         name=name,
@@ -116,10 +116,9 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
             "action": ("dx", "dy", "dz"),
         },
         n_episodes=len(behaviors),
-        demonstrations=lambda seed, work_dir: generate(
-            AligningJob(shuffled(seed), seed), len(behaviors), work_dir
-        ),
+        demonstrations=lambda seed: map(job(seed), range(len(behaviors))),
         behavior_rule=aligning_behavior,
+        resumable_demonstrations=lambda seed, work_dir: generate(job(seed), len(behaviors), work_dir),
     )
 
 

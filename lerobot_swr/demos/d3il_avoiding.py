@@ -6,7 +6,6 @@ simulation. All constants were fixed before any policy was trained on the datase
 times in steps.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -137,13 +136,13 @@ class AvoidingJob:
         )
 
 
-def _shuffled(counts: Sequence[tuple[str, int]], seed: int) -> tuple[str, ...]:
-    behaviors = np.array([behavior for behavior, count in counts for _ in range(count)])
-    return tuple(str(b) for b in np.random.default_rng(seed).permutation(behaviors))
-
-
 def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
     n_episodes = sum(counts.values())
+
+    def job(seed: int) -> AvoidingJob:
+        behaviors = [behavior for behavior, count in counts.items() for _ in range(count)]
+        return AvoidingJob(tuple(map(str, np.random.default_rng(seed).permutation(behaviors))), seed)
+
     return DatasetRecipe(
         name=name,
         instruction=AVOIDING_DESCRIPTION,
@@ -155,10 +154,9 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
             "action": ("dx", "dy"),
         },
         n_episodes=n_episodes,
-        demonstrations=lambda seed, work_dir: generate(
-            AvoidingJob(_shuffled(tuple(counts.items()), seed), seed), n_episodes, work_dir
-        ),
+        demonstrations=lambda seed: map(job(seed), range(n_episodes)),
         behavior_rule=avoiding_behavior,
+        resumable_demonstrations=lambda seed, work_dir: generate(job(seed), n_episodes, work_dir),
     )
 
 

@@ -44,11 +44,15 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
     if not files:
         raise ValueError(f"from_d3il={str(folder)!r}: no recordings (*.pkl) in it")
 
-    def demonstrations(seed: int, work_dir: Path) -> Iterator[Demonstration]:
+    def demonstrations(seed: int) -> Iterator[Demonstration]:
         return (convert_recording(path, task) for path in files)
 
     return replace(
-        _RECIPES[task], name=f"d3il_recorded_{task}", n_episodes=len(files), demonstrations=demonstrations
+        _RECIPES[task],
+        name=f"d3il_recorded_{task}",
+        n_episodes=len(files),
+        demonstrations=demonstrations,
+        resumable_demonstrations=None,
     )
 
 

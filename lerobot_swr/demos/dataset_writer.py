@@ -13,7 +13,7 @@ from datasets import disable_progress_bars
 from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
-from lerobot_swr.demos.recipe import DatasetRecipe
+from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 
 
 def write_dataset(
@@ -22,8 +22,8 @@ def write_dataset(
     """Write a dataset into `root`.
 
     The dataset is built in a hidden work folder beside `root` and moved there when it is complete, so that an
-    interrupted run leaves nothing half-written and an overwritten dataset is replaced at once. Where the recipe
-    keeps finished episodes in the work folder, the next run with the same seed continues from them.
+    interrupted run leaves nothing half-written and an overwritten dataset is replaced at once. Where the
+    recipe keeps finished episodes in the work folder, the next run with the same seed continues from them.
 
     Args:
         recipe: What to write.
@@ -62,25 +62,27 @@ def write_dataset(
         disable_progress_bars()  # those of `datasets`, one per episode
         try:
             for demonstration in tqdm(
-                recipe.demonstrations(seed, work_dir / "episodes"),
+                _demonstrations(recipe, seed, work_dir),
                 total=recipe.n_episodes,
                 desc=recipe.name,
                 unit="episode",
             ):
-                columns = {**demonstration.observations, "action": demonstration.actions}
-                for t in range(len(demonstration.actions)):
-                    frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
-                    dataset.add_frame({**frame, "task": recipe.instruction})
-                dataset.save_episode()
+                _add_episode(dataset, demonstration, recipe.instruction)
                 histogram[recipe.behavior_rule(demonstration.observations)] += 1
         finally:
-            dataset.finalize()  # after an error too: its destructor would write into the removed folder
+            dataset.finalize()  # else the writer would do so later, in a folder that is gone by then
         _sort_statistics(Path(workspace) / "dataset" / "meta" / "stats.json")
         if root.exists():
             shutil.rmtree(root)
         (Path(workspace) / "dataset").rename(root)
     shutil.rmtree(work_dir)
     return histogram
+
+
+def _demonstrations(recipe: DatasetRecipe, seed: int, work_dir: Path) -> Iterator[Demonstration]:
+    if recipe.resumable_demonstrations is None:
+        return recipe.demonstrations(seed)
+    return recipe.resumable_demonstrations(seed, work_dir / "episodes")
 
 
 @contextmanager
@@ -92,6 +94,14 @@ def _removed_if_useless(work_dir: Path) -> Iterator[None]:
         if not any(path.is_file() for path in work_dir.rglob("*")):
             shutil.rmtree(work_dir)
         raise
+
+
+def _add_episode(dataset: LeRobotDataset, demonstration: Demonstration, instruction: str) -> None:
+    columns = {**demonstration.observations, "action": demonstration.actions}
+    for t in range(len(demonstration.actions)):
+        frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
+        dataset.add_frame({**frame, "task": instruction})
+    dataset.save_episode()
 
 
 def _sort_statistics(path: Path) -> None:

@@ -148,7 +148,7 @@ def _recipe(name: str, task: str, counts: dict[str, int], speed: SpeedRule) -> D
             "action": ("dx", "dy"),
         },
         n_episodes=len(behaviors),
-        demonstrations=lambda seed, work_dir: demonstrate(task, behaviors, speed, seed),
+        demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed),
         behavior_rule=MazeBehaviorRule(get_layout(task)),
     )
 

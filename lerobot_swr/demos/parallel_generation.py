@@ -72,9 +72,8 @@ def save_episode(path: Path, episode: Demonstration) -> None:
     """Write an episode so that the file is either complete or not there."""
     temporary = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with temporary.open("wb") as file:
-        np.savez(
-            file, **{f"observations/{k}": v for k, v in episode.observations.items()}, actions=episode.actions
-        )
+        observations = {f"observations/{key}": value for key, value in episode.observations.items()}
+        np.savez(file, actions=episode.actions, **observations)  # type: ignore[arg-type]
     temporary.replace(path)
 
 

@@ -35,10 +35,11 @@ class DatasetRecipe:
         robot_type: Stored in the dataset's metadata.
         features: LeRobot feature name (observations and ``action``) to the names of its dimensions.
         n_episodes: Number of demonstrations.
-        demonstrations: Maps a seed and a folder to the episodes, in their order in the dataset. Deterministic in
-            the seed. A source that takes long may keep finished episodes in the folder (not yet made, unless by
-            an interrupted run with the same seed) and continue from them.
+        demonstrations: Maps a seed to the episodes, in their order in the dataset. Deterministic in the seed.
         behavior_rule: Labels an episode of this dataset.
+        resumable_demonstrations: For a source that takes long, if not None: the same episodes, made on all
+            cores; finished ones are kept in the folder given, and those that an interrupted run with the same
+            seed left there are used.
     """
 
     name: str
@@ -47,5 +48,6 @@ class DatasetRecipe:
     robot_type: str
     features: Mapping[str, tuple[str, ...]]
     n_episodes: int
-    demonstrations: Callable[[int, Path], Iterator[Demonstration]]
+    demonstrations: Callable[[int], Iterator[Demonstration]]
     behavior_rule: BehaviorRule
+    resumable_demonstrations: Callable[[int, Path], Iterator[Demonstration]] | None = None

@@ -35,8 +35,8 @@ def load_recording(path: Path) -> Any:
         return _with_arrays(loaded)
     except UnsafePickleError as error:
         raise UnsafePickleError(
-            f"{path}: refused, it asks for {error}; recordings may hold numpy arrays and plain containers
-            only"
+            f"{path}: refused, it asks for {error}; recordings may hold "
+            "numpy arrays and plain containers only"
         ) from error
     except OSError:
         raise

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.network import ActionNetwork
-from lerobot_swr.sampling import SimilarityWeightedSampler
+from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import cached_distances
 from lerobot_swr.styles import StyleCookbook
 from lerobot_swr.trajectories import Trajectories, load_trajectories
@@ -310,6 +310,7 @@ class WZBCPolicy(ZBCPolicy):
 
     def __init__(self, config: WZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
+        self.draws = StepGenerator()
         self.sampler: SimilarityWeightedSampler | None = None
         if dataset_meta is not None:
             if len(self.styles) < 2:
@@ -340,29 +341,29 @@ class WZBCPolicy(ZBCPolicy):
         return cached_distances(self._trajectories, keys, self._dataset_root)
 
     def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """(B,) loss of each frame: W(τ_i, τ_j) · |π(s, z_j) − a|², with j = i where it is not relabelled.
+        """(B,) weighted loss of each frame under its pair's style, whose mean has algorithm 1's expectation.
 
-        Figures to log: ``own_style_loss`` and ``relabelled_loss``, the mean error of the frames that keep
-        their style and of those that do not, before weighting; ``mean_weight`` of the latter; and
-        ``effective_demos`` per style. The first three divide by the expected number of such frames, not by
-        the batch's, so that a batch without any is no special case and their averages over time are unbiased.
+        Figures to log: ``own_style_loss``, the mean squared error of frames under their own style;
+        ``relabelled_loss``, the mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``, the mean
+        of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates, whichever way
+        pairs are drawn, and defined for every batch: read their averages over time.
         """
         if not self.training or self.sampler is None:
             return super().frame_losses(batch)
         episodes = batch["episode_index"]
         self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained)
-        pairs = self.sampler.draw(episodes)
+        pairs = self.sampler.draw(episodes, self.draws.next())
         style = self.styles.embedding(pairs.styles)
         style = torch.where(pairs.relabelled[:, None], style.detach(), style)
-        errors = self._action_errors(self.network(batch, style), batch)
+        losses = self._action_errors(self.network(batch, style), batch) * pairs.weights
 
         p = self.config.p
         figures = {"effective_demos": self.sampler.effective_demos}
         with torch.no_grad():
             if p < 1:
-                figures["own_style_loss"] = (errors * ~pairs.relabelled).mean().item() / (1 - p)
+                figures["own_style_loss"] = (losses * ~pairs.relabelled).mean().item() / (1 - p)
             if p > 0:
-                figures["relabelled_loss"] = (errors * pairs.relabelled).mean().item() / p
+                figures["relabelled_loss"] = (losses * pairs.relabelled).mean().item() / p
                 figures["mean_weight"] = (pairs.weights * pairs.relabelled).mean().item() / p
-        return errors * pairs.weights, figures
+        return losses, figures

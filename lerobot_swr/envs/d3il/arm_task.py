@@ -31,7 +31,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         render_width: Of the pictures, in pixels.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": FPS}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  as Gymnasium declares it
     task: ClassVar[str]
     task_description: ClassVar[str]
 
@@ -55,7 +55,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         self._desired = self._start_tool.copy()
         self._n_axes = n_axes
         self.action_space = gym.spaces.Box(-ACTION_LIMIT_M, ACTION_LIMIT_M, (n_axes,), np.float32)
-        self.observation_space = gym.spaces.Dict(
+        self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]
             {
                 key: gym.spaces.Box(-_OBSERVATION_BOUND, _OBSERVATION_BOUND, (size,), np.float32)
                 for key, size in (("agent_pos", 2 * n_axes), ("environment_state", environment_state_size))

@@ -25,7 +25,7 @@ INSIDE, OUTSIDE = "inside", "outside"
 NOT_ALIGNED = "not_aligned"
 
 GAP_NAMES = (("top", "bottom"), ("top", "mid", "bottom"), ("top", "midtop", "midbottom", "bottom"))
-"""Names of the gaps at each level, from small to large x; pictures show small x (the robot's side) at the top."""
+"""Names of the gaps at each level, from small to large x; small x (the robot) is at the top of pictures."""
 
 AVOIDING_BEHAVIORS = tuple(f"{a}-{b}-{c}" for a in GAP_NAMES[0] for b in GAP_NAMES[1] for c in GAP_NAMES[2])
 """The 24 ways through the three levels."""

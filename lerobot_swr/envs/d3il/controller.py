@@ -1,9 +1,9 @@
 """The arm's controller, once per millisecond: inverse kinematics, joint PD, finger forces; compiled.
 
 It is the benchmark's controller (Jia et al., ICLR 2024; gains from its published configuration), rewritten
-from its equations. The inverse kinematics integrates its own last result, open loop; the low PD gains let the measured
-tool lag behind the desired one by about a centimetre, which is part of the task. A coarser control period
-loses this behaviour and gains no speed: an inverse-kinematics update costs less than a physics step.
+from its equations. The inverse kinematics integrates its own last result, open loop; the low PD gains let
+the measured tool lag behind the desired one by about a centimetre, which is part of the task. A coarser
+control period loses this behaviour and gains no speed: inverse kinematics costs less than a physics step.
 
 All functions live in one module because numba's on-disk cache notices changes in the caller's file only.
 """

@@ -70,10 +70,9 @@ def _open_gl(width: int, height: int):
     """An OpenGL context of the renderer that MUJOCO_GL names, or else of one that works without a screen."""
     named = os.environ.get("MUJOCO_GL", "").lower().strip()
     has_screen = bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+    modules = ["mujoco.egl", "mujoco.osmesa"]
     if named or has_screen or platform.system() != "Linux":
-        modules = ("mujoco.gl_context",)
-    else:
-        modules = ("mujoco.egl", "mujoco.osmesa")
+        modules = ["mujoco.gl_context"]
     failures = []
     for module in modules:
         try:
