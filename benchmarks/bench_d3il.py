@@ -1,6 +1,6 @@
 """Environment steps per second of the D3IL tasks, on one core and in the threaded vector environment.
 
-Run: python benchmarks/d3il_speed.py [--repeats 5]. The workload is what a policy causes: the reference-like
+Run: python benchmarks/bench_d3il.py [--repeats 5]. The workload is what a policy causes: the reference-like
 motion of 5 to 9 mm per step, with the rod pushing the box for most of the aligning steps. CPU time is printed
 beside wall time, because on a shared machine only the former says what the code costs.
 """
