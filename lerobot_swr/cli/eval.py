@@ -26,11 +26,10 @@ from lerobot.utils.utils import init_logging
 from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import evaluate_behaviors, format_result, write_json
+from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, write_json
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.evaluation.offline import KINDS, format_offline, frame_errors, summarize
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
-from lerobot_swr.evaluation.rollouts import run_rollouts
 from lerobot_swr.styles import check_style_sampling
 
 
@@ -110,17 +109,22 @@ def evaluate(cfg: EvalCommand) -> None:
         print(f"{title}\n{format_offline(offline)}\nwritten to {cfg.output_dir}")
         return
 
-    rule = _rule(cfg)
-    demonstrated = [rule(episode) for episode in trajectories.episodes()]
-    rollouts = run_rollouts(checkpoint, cfg.env, rule, cfg.n_episodes, cfg.batch_size, cfg.seed)
-    sampling = checkpoint.policy.config.style_sampling if checkpoint.has_styles else None
-    result = evaluate_behaviors(rollouts, demonstrated, sampling, cfg.dataset.episodes)
+    comparison = compare(
+        checkpoint,
+        trajectories,
+        cfg.env,
+        _rule(cfg),
+        n_episodes=cfg.n_episodes,
+        batch_size=cfg.batch_size,
+        seed=cfg.seed,
+        reference_episodes=cfg.dataset.episodes,
+    )
+    result = comparison.result
     write_json(cfg.output_dir / "behaviors.json", result, _provenance(cfg))
-    reference = range(len(trajectories)) if cfg.dataset.episodes is None else cfg.dataset.episodes
     plot_behaviors(
         cfg.output_dir / "behaviors.png",
-        [(_path(cfg.env, trajectories.episode(i)), demonstrated[i]) for i in reference],
-        [(_path(cfg.env, rollout.observations), rollout.behavior) for rollout in rollouts],
+        comparison.demonstrations,
+        comparison.rollouts,
         result.reference_histogram,
         result.histogram,
         cfg.env,
@@ -138,12 +142,6 @@ def _rule(cfg: EvalCommand) -> BehaviorRule:
         f"env.type={cfg.env.type!r} has no behaviour rule of its own: name one with "  # type: ignore[union-attr]
         "--behavior_rule=module:function"
     )
-
-
-def _path(env_cfg: EnvConfig, observations: dict) -> Any:
-    if isinstance(env_cfg, TaskEnvConfig):
-        return env_cfg.plot_path(observations)
-    return observations["observation.state"][:, :2]
 
 
 def _provenance(cfg: EvalCommand) -> dict[str, Any]:

@@ -3,11 +3,17 @@
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from lerobot.envs import EnvConfig
+
+from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import (
     Histogram,
     Interval,
@@ -20,7 +26,8 @@ from lerobot_swr.evaluation.metrics import (
     success_entropy,
     success_interval,
 )
-from lerobot_swr.evaluation.rollouts import Rollout
+from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.trajectories import Trajectories
 
 
 @dataclass(frozen=True)
@@ -105,6 +112,61 @@ def evaluate_behaviors(
             for rollout in rollouts
         ],
     )
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A behaviour evaluation and what its pictures show.
+
+    Attributes:
+        result: The figures.
+        demonstrations: Paths (T, 2) of the reference demonstrations and their labels.
+        rollouts: Paths (T, 2) of the rollouts and their labels.
+    """
+
+    result: BehaviorResult
+    demonstrations: list[tuple[np.ndarray, str]]
+    rollouts: list[tuple[np.ndarray, str]]
+
+
+def compare(
+    checkpoint: Checkpoint,
+    trajectories: Trajectories,
+    env_cfg: EnvConfig,
+    rule: BehaviorRule,
+    *,
+    n_episodes: int = 100,
+    batch_size: int = 100,
+    seed: int = 1000,
+    reference_episodes: Sequence[int] | None = None,
+) -> Comparison:
+    """Roll a policy out and compare it with its demonstrations.
+
+    Args:
+        checkpoint: The policy.
+        trajectories: The demonstrations.
+        env_cfg: The environment.
+        rule: Labels an episode from its observations.
+        n_episodes: Number of rollouts.
+        batch_size: Largest number of environments that run at once.
+        seed: Seeds the drawing of styles and the environments.
+        reference_episodes: The demonstrations to compare with; None takes all.
+    """
+    demonstrated = [rule(episode) for episode in trajectories.episodes()]
+    rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed)
+    sampling = checkpoint.policy.config.style_sampling if checkpoint.has_styles else None
+    chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
+    return Comparison(
+        evaluate_behaviors(rollouts, demonstrated, sampling, reference_episodes),
+        [(_path(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
+        [(_path(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
+    )
+
+
+def _path(env_cfg: EnvConfig, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+    if isinstance(env_cfg, TaskEnvConfig):
+        return env_cfg.plot_path(observations)
+    return observations["observation.state"][:, :2]
 
 
 def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:

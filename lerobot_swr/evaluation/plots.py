@@ -58,6 +58,29 @@ def plot_behaviors(
     figure.savefig(path, dpi=110)
 
 
+def plot_comparison(
+    path: Path, demonstrations: Paths, policies: Mapping[str, Paths], env_cfg: EnvConfig, title: str
+) -> None:
+    """Demonstrations beside the rollouts of several policies, in one row.
+
+    Args:
+        path: Where to write the picture.
+        demonstrations: Paths of the demonstrations.
+        policies: Heading of each further panel and its paths.
+        env_cfg: Draws the scene, if it is one of this package's tasks.
+        title: Heading of the picture.
+    """
+    panels = {"demonstrations": demonstrations, **policies}
+    figure = Figure(figsize=(3.3 * len(panels), 3.9), layout="constrained")
+    colors = behavior_colors([label for paths in panels.values() for _, label in paths])
+    for axes, (name, paths) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+        draw_paths(axes, paths, colors, env_cfg)
+        axes.set_title(name)
+    figure.suptitle(title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+
+
 def draw_paths(axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig) -> None:
     """Paths in the scene, coloured by behaviour."""
     if isinstance(env_cfg, TaskEnvConfig):

@@ -110,7 +110,9 @@ class Maze2DEnvConfig(TaskEnvConfig):
             edges = [0.0]
             for door in sorted(wall.doors, key=lambda door: door.x):
                 edges += [door.x - door.half_width, door.x + door.half_width]
-                axes.text(door.x, wall.y, str(door.checkpoint), color="0.5", ha="center", va="center")
+                axes.text(
+                    door.x, wall.y, str(door.checkpoint), color="0.4", ha="center", va="center", zorder=5
+                )
             edges.append(1.0)
             for left, right in zip(edges[::2], edges[1::2], strict=True):
                 axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")

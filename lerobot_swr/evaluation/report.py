@@ -1,0 +1,109 @@
+"""One self-contained HTML page from tables and pictures."""
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jinja2 import Environment
+
+TEMPLATE = """<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ title }}</title>
+<style>
+  body { font: 16px/1.55 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color:
+  #222; } h1 { font-size: 1.7rem; } h2 { font-size: 1.25rem; margin-top: 2.2rem; }
+  img { max-width: 100%; display: block; }
+  figure { margin: 1.2rem 0; } figcaption, .note { color: #555; font-size: .9rem; }
+  .scroll { overflow-x: auto; }
+  table { border-collapse: collapse; margin: 1rem 0; } caption { text-align: left; color: #555; font-size:
+  .9rem; } th, td { padding: .3rem .8rem; text-align: right; border-bottom: 1px solid #ddd; white-space:
+  nowrap; } th:first-child, td:first-child { text-align: left; } thead th { border-bottom: 2px solid #888; }
+  pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: .82rem; }
+</style>
+</head>
+<body>
+<h1>{{ title }}</h1>
+<p>{{ introduction }}</p>
+{% for section in sections %}
+<h2>{{ section.title }}</h2>
+{% for table in section.tables %}
+<div class="scroll"><table>
+<caption>{{ table.caption }}</caption>
+<thead><tr>{% for cell in table.header %}<th>{{ cell }}</th>{% endfor %}</tr></thead>
+<tbody>
+{% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>
+{% endfor %}</tbody>
+</table></div>
+{% endfor %}
+{% for figure in section.figures %}
+<figure><img src="data:image/png;base64,{{ figure.png }}" alt="{{ figure.caption }}">
+<figcaption>{{ figure.caption }}</figcaption></figure>
+{% endfor %}
+{% endfor %}
+<h2>How this was made</h2>
+<pre>{{ commands | join("\n") }}</pre>
+<p class="note">{{ versions }}</p>
+</body>
+</html>
+"""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: what it shows, the heads of its columns, and its cells."""
+
+    caption: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A PNG file and what it shows."""
+
+    caption: str
+    path: Path
+
+    @property
+    def png(self) -> str:
+        """The file's content, base64-encoded."""
+        return base64.b64encode(self.path.read_bytes()).decode()
+
+
+@dataclass(frozen=True)
+class Section:
+    """A heading, then tables, then pictures."""
+
+    title: str
+    tables: Sequence[Table]
+    figures: Sequence[Picture]
+
+
+def write_report(
+    path: Path,
+    title: str,
+    introduction: str,
+    sections: Sequence[Section],
+    commands: Sequence[str],
+    versions: str,
+) -> None:
+    """Write the page; it needs no other file.
+
+    Args:
+        path: The HTML file.
+        title: Heading of the page.
+        introduction: A paragraph below it.
+        sections: The page's body.
+        commands: What to type to make the results again.
+        versions: Software versions.
+    """
+    template = Environment(autoescape=True).from_string(TEMPLATE)
+    page = template.render(
+        title=title, introduction=introduction, sections=sections, commands=commands, versions=versions
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page, encoding="utf-8")
