@@ -80,3 +80,13 @@ def load_function(key: str, path: str) -> Callable[..., Any]:
     if not callable(function):
         raise ValueError(f"{key}={path!r}: {function_name} is not callable")
     return function
+
+
+def load_style_metrics(paths: str | None) -> dict[str, Callable[..., Any]]:
+    """Import user metrics given as ``module:function``, several separated by commas, by function name.
+
+    Raises:
+        ValueError: If a path does not lead to a function.
+    """
+    listed = [path.strip() for path in (paths or "").split(",") if path.strip()]
+    return {path.partition(":")[2]: load_function("style_metrics", path) for path in listed}

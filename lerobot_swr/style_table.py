@@ -72,6 +72,16 @@ class StyleTable:
         self.matches(text)
         return replace(self, filters={**self.filters, name: text})
 
+    def without_filter(self, name: str) -> "StyleTable":
+        """The table without one of its named filters.
+
+        Raises:
+            ValueError: If there is no such filter.
+        """
+        if name not in self.filters:
+            raise ValueError(f"{name!r} is no named filter; known: {', '.join(self.filters) or 'none'}")
+        return replace(self, filters={key: text for key, text in self.filters.items() if key != name})
+
     def extended(self, other: "StyleTable") -> "StyleTable":
         """The table with the rows of `other` below, which has the same columns; filters are this table's."""
         columns = {name: values + other.columns[name] for name, values in self.columns.items()}

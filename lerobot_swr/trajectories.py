@@ -52,6 +52,13 @@ class Trajectories:
         joined = np.concatenate([self.columns[key] for key in keys], axis=1)
         return np.split(joined, self.starts[1:])
 
+    def subset(self, episodes: Sequence[int]) -> "Trajectories":
+        """Some of the episodes, in the given order."""
+        parts = [self.episode(i) for i in episodes]
+        columns = {key: np.concatenate([part[key] for part in parts]) for key in self.columns}
+        tasks = tuple(self.tasks[i] for i in episodes) if self.tasks else ()
+        return Trajectories(self.lengths[list(episodes)], columns, self.fps, self.name, tasks)
+
     def fingerprint(self, keys: Sequence[str]) -> str:
         """Hash of the content of the features `keys` and of the episodes' lengths, in hexadecimal."""
         digest = hashlib.sha256(np.ascontiguousarray(self.lengths).tobytes())

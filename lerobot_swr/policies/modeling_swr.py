@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
-from lerobot_swr.behaviors import dataset_behavior_rule, load_function
+from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.network import ActionNetwork
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
@@ -315,16 +315,16 @@ class ZBCPolicy(BCPolicy):
             raise RuntimeError(
                 "distances between episodes need the dataset: create the policy with dataset_meta"
             )
-        return cached_distances(self._trajectories, self._compared_keys(), Path(self._dataset_meta.root))
+        return cached_distances(self._trajectories, self.compared_keys(), Path(self._dataset_meta.root))
 
-    def _compared_keys(self) -> Sequence[str]:
+    def compared_keys(self) -> Sequence[str]:
+        """The features over which ν compares demonstrations."""
         return self.config.observation_keys
 
     def _make_table(self, meta: LeRobotDatasetMetadata) -> StyleTable:
         assert self._trajectories is not None
         rule = dataset_behavior_rule(self.config.behavior_rule, meta.robot_type)
-        paths = [path.strip() for path in (self.config.style_metrics or "").split(",") if path.strip()]
-        metrics = {path.partition(":")[2]: load_function("style_metrics", path) for path in paths}
+        metrics = load_style_metrics(self.config.style_metrics)
         return make_style_table(self._trajectories, self.distances(), rule, metrics)
 
     def reset(self) -> None:
@@ -437,7 +437,12 @@ class WZBCPolicy(ZBCPolicy):
                 config.partner_sampling,  # type: ignore[arg-type]
             )
 
-    def _compared_keys(self) -> Sequence[str]:
+    def compared_keys(self) -> Sequence[str]:
+        """The features over which ν compares demonstrations.
+
+        Raises:
+            ValueError: If a configured feature is unknown.
+        """
         keys = self.config.similarity_keys or self.config.observation_keys
         known = [*self.config.observation_keys, ACTION]
         unknown = [key for key in keys if key not in known]
