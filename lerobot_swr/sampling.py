@@ -33,7 +33,7 @@ class SimilarityWeightedSampler:
     """Draws pairs (i, j) for given episodes i, with j ≠ i at probability p.
 
     ``uniform`` draws j uniformly and weights the loss by W(τ_i, τ_j), as the paper does; ``weighted`` draws
-    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and a lower variance. Draws
+    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and spares the variance of the weights. Draws
     come from torch's global generator, which LeRobot saves and restores with a checkpoint.
 
     Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.

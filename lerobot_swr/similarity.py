@@ -28,6 +28,9 @@ logger = logging.getLogger(__name__)
 def pairwise_distances(states: Sequence[np.ndarray]) -> np.ndarray:
     """Euclidean distances of state sequences padded to a common length by repeating their last state.
 
+    The common length is that of the longest episode of all, so that every episode is one vector and the
+    distances form a metric.
+
     Differences are squared directly, in float64 and over blocks of time, so that equal episodes have distance
     exactly 0 (the faster expansion |x|² − 2x·y + |y|² loses small distances) and memory stays bounded.
 

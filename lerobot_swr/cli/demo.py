@@ -98,7 +98,7 @@ def demo(cfg: DemoCommand) -> None:
         "Each policy is trained on demonstrations that solve one maze in several ways. L1 is the distance "
         "between the behaviour histograms of demonstrations and rollouts, 0 (equal) to 2 (disjoint). With "
         "styles drawn uniformly even a perfect reproducer scores the floor; with each style used once "
-        "(stratified) its L1 is 0. One training seed per policy: read differences of a few hundredths as noise.",
+        "(stratified) its L1 is 0. One training seed per policy: differences of a few hundredths are noise.",
         sections,
         ["lerobot-swr-demo " + " ".join(sys.argv[1:])] + [" ".join(t.command) for t in trainings],
         ", ".join(f"{name} {version(name)}" for name in ("lerobot_policy_swr", "lerobot", "torch")),

@@ -11,7 +11,7 @@ from datasets import disable_progress_bars
 from lerobot.datasets import LeRobotDataset
 from tqdm import tqdm
 
-from lerobot_swr.demos.recipe import DatasetRecipe
+from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 
 
 def write_dataset(
@@ -51,21 +51,27 @@ def write_dataset(
             use_videos=False,
         )
         disable_progress_bars()  # those of `datasets`, one per episode
-        for demonstration in tqdm(
-            recipe.demonstrations(seed), total=recipe.n_episodes, desc=recipe.name, unit="episode"
-        ):
-            columns = {**demonstration.observations, "action": demonstration.actions}
-            for t in range(len(demonstration.actions)):
-                frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
-                dataset.add_frame({**frame, "task": recipe.instruction})
-            dataset.save_episode()
-            histogram[recipe.behavior_rule(demonstration.observations)] += 1
-        dataset.finalize()
+        try:
+            for demonstration in tqdm(
+                recipe.demonstrations(seed), total=recipe.n_episodes, desc=recipe.name, unit="episode"
+            ):
+                _add_episode(dataset, demonstration, recipe.instruction)
+                histogram[recipe.behavior_rule(demonstration.observations)] += 1
+        finally:
+            dataset.finalize()  # else the writer would do so later, in a folder that is gone by then
         _sort_statistics(Path(workspace) / "dataset" / "meta" / "stats.json")
         if root.exists():
             shutil.rmtree(root)
         (Path(workspace) / "dataset").rename(root)
     return histogram
+
+
+def _add_episode(dataset: LeRobotDataset, demonstration: Demonstration, instruction: str) -> None:
+    columns = {**demonstration.observations, "action": demonstration.actions}
+    for t in range(len(demonstration.actions)):
+        frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
+        dataset.add_frame({**frame, "task": instruction})
+    dataset.save_episode()
 
 
 def _sort_statistics(path: Path) -> None:

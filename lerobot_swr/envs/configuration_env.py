@@ -47,10 +47,7 @@ class TaskEnvConfig(EnvConfig):
         Unlike LeRobot's default, a finished sub-environment is frozen instead of being reset at once: its
         last state is needed to label the behaviour, and it costs nothing while slower episodes go on.
         """
-        make_one = partial(
-            gym.make, self.gym_id, disable_env_checker=self.disable_env_checker, **self.gym_kwargs
-        )
-        env_fns = [freeze_after_episode_end(make_one) for _ in range(n_envs)]
+        env_fns = [freeze_after_episode_end(partial(_make_one, self)) for _ in range(n_envs)]
         if use_async_envs and n_envs > 1:
             vector_env: gym.vector.VectorEnv = AsyncVectorEnv(
                 env_fns, autoreset_mode=AutoresetMode.SAME_STEP, context="forkserver"
@@ -62,3 +59,8 @@ class TaskEnvConfig(EnvConfig):
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
         """The fastest vector environment of this task in this process, for behaviour evaluation."""
         return self.create_envs(n_envs)[self.type][0]
+
+
+def _make_one(config: TaskEnvConfig) -> gym.Env:
+    """One sub-environment. The configuration goes along so that a worker process registers its Gymnasium id."""
+    return gym.make(config.gym_id, disable_env_checker=config.disable_env_checker, **config.gym_kwargs)

@@ -1,0 +1,105 @@
+"""Datasets, policies and commands that the tests share."""
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+os.environ["HF_HUB_OFFLINE"] = "1"
+
+import pytest
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
+from lerobot.policies.factory import make_policy_config
+from lerobot.scripts import lerobot_train
+
+import lerobot_swr  # noqa: F401  (registers policies and environments)
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.maze2d import _recipe, steady
+
+SMALL_MAZE = {"10": 4, "20": 2}  # behaviour -> number of episodes
+
+
+@pytest.fixture(scope="session")
+def small_maze(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a dataset of 6 episodes in the small maze; tests must not change it."""
+    root = tmp_path_factory.mktemp("datasets") / "small_maze"
+    write_dataset(_recipe("small_maze", "small", SMALL_MAZE, steady), root, seed=0)
+    return root
+
+
+@pytest.fixture(scope="session")
+def small_maze_meta(small_maze: Path) -> LeRobotDatasetMetadata:
+    """Metadata of `small_maze`."""
+    return LeRobotDatasetMetadata("local/small_maze", root=small_maze)
+
+
+@pytest.fixture
+def make_tiny_policy(small_maze_meta: LeRobotDatasetMetadata) -> Callable[..., PreTrainedPolicy]:
+    """Builds a small policy on `small_maze` through LeRobot's factory, the same for the same seed."""
+
+    def make(policy_type: str, seed: int = 0, **options) -> PreTrainedPolicy:
+        torch.manual_seed(seed)
+        options = {"hidden_dim": 16, "num_hidden": 3, "device": "cpu", "push_to_hub": False, **options}
+        return make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
+
+    return make
+
+
+def make_batch(n_frames: int = 32, n_episodes: int = 6, seed: int = 1) -> dict[str, torch.Tensor]:
+    """A batch of normalised frames of the small maze's dimensions, every episode in it."""
+    generator = torch.Generator().manual_seed(seed)
+    return {
+        "observation.state": torch.randn(n_frames, 2, generator=generator),
+        "observation.environment_state": torch.randn(n_frames, 2, generator=generator),
+        "action": torch.randn(n_frames, 2, generator=generator),
+        "episode_index": torch.arange(n_frames) % n_episodes,
+    }
+
+
+def save_checkpoint(policy: PreTrainedPolicy, meta: LeRobotDatasetMetadata, folder: Path) -> Path:
+    """Save a policy with its processors, as LeRobot does after training."""
+    preprocessor, postprocessor = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
+    policy.save_pretrained(folder)
+    preprocessor.save_pretrained(folder)
+    postprocessor.save_pretrained(folder)
+    return folder
+
+
+@pytest.fixture
+def lerobot_train_command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs ``lerobot-train`` with the given flags in this process."""
+
+    def run(*flags: str) -> None:
+        monkeypatch.setattr(sys, "argv", ["lerobot-train", *flags])
+        lerobot_train.main()
+
+    return run
+
+
+@pytest.fixture
+def run_command(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Runs one of this package's commands with the given flags in this process."""
+
+    def run(main: Callable[[], None], *flags: str) -> None:
+        monkeypatch.setattr(sys, "argv", [main.__module__, *map(str, flags)])
+        main()
+
+    return run
+
+
+def train_flags(policy_type: str, root: Path, output_dir: Path, steps: int, *more: str) -> list[str]:
+    """Flags of a short ``lerobot-train`` run on the CPU."""
+    return [
+        f"--policy.type={policy_type}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        f"--dataset.repo_id=local/{root.name}",
+        f"--dataset.root={root}",
+        "--batch_size=8",
+        "--num_workers=0",
+        f"--steps={steps}",
+        f"--output_dir={output_dir}",
+        *more,
+    ]

@@ -1,0 +1,80 @@
+"""The style cookbook."""
+
+from collections import Counter
+
+import pytest
+import torch
+
+from lerobot_swr.styles import StyleCookbook
+
+
+def make_cookbook(trained=range(6), **options) -> StyleCookbook:
+    torch.manual_seed(0)
+    cookbook = StyleCookbook(6, style_dim=3, init_scale=0.1, **options)
+    cookbook.mark_trained(torch.tensor(list(trained), dtype=torch.long))
+    return cookbook
+
+
+def test_uniform_drawing_is_uniform_over_trained_styles():
+    """Every trained style at its share, no other one ever."""
+    counts = Counter(make_cookbook(trained=[0, 2, 5]).draw(9000).tolist())
+    assert set(counts) == {0, 2, 5}
+    assert all(abs(count - 3000) < 250 for count in counts.values())
+
+
+def test_stratified_drawing_uses_each_style_once_before_any_again_across_rollouts():
+    """Batches of 4 over 6 styles: the first 6 draws are a permutation, so are the next 6."""
+    cookbook = make_cookbook(sampling="stratified")
+    drawn = torch.cat([cookbook.draw(4) for _ in range(3)]).tolist()
+    assert sorted(drawn[:6]) == list(range(6))
+    assert sorted(drawn[6:]) == list(range(6))
+    assert drawn[:6] != drawn[6:]
+
+
+def test_fixed_drawing_keeps_the_given_order():
+    """Styles in their order, over and over."""
+    cookbook = make_cookbook(sampling="fixed", episodes=[4, 1])
+    assert cookbook.draw(3).tolist() == [4, 1, 4]
+    assert cookbook.draw(2).tolist() == [1, 4]
+
+
+def test_a_style_is_kept_to_the_end_of_the_rollout_and_drawn_anew_after_it():
+    """One style per environment, the same at every step; others after the rollout."""
+    cookbook = make_cookbook(sampling="stratified")
+    first = cookbook.active_styles(6)
+    assert torch.equal(cookbook.active_styles(6), first)
+    before = cookbook.active.tolist()
+    cookbook.end_rollout()
+    cookbook.active_styles(6)
+    assert cookbook.active.tolist() != before
+    assert torch.equal(first, cookbook.embedding(torch.tensor(before)))
+
+
+def test_another_batch_size_within_a_rollout_is_an_error():
+    """A missed reset is told instead of mixing styles up."""
+    cookbook = make_cookbook()
+    cookbook.active_styles(3)
+    with pytest.raises(ValueError, match=r"batch of 2 .* call policy.reset"):
+        cookbook.active_styles(2)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sampling": "random"}, "style_sampling='random'"),
+        ({"episodes": []}, r"style_episodes=\[\].*empty"),
+        ({"episodes": [2, 6]}, r"episodes \[6\] do not exist.*0 to 5"),
+    ],
+)
+def test_bad_options_are_named(options, message):
+    """Unknown options and empty or impossible selections are refused when the cookbook is made."""
+    with pytest.raises(ValueError, match=message):
+        make_cookbook(**options)
+
+
+def test_untrained_styles_cannot_be_selected():
+    """A selected episode that was not trained on has no style."""
+    with pytest.raises(ValueError, match=r"episodes \[3\] were not in the training data"):
+        make_cookbook(trained=[0, 1], episodes=[1, 3]).draw(1)
+    with pytest.raises(ValueError, match="no style has been trained"):
+        make_cookbook(trained=[]).draw(1)
