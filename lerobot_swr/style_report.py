@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -63,7 +64,7 @@ def _histogram(everything: Sequence[Value], kept: Sequence[Value]) -> list[str]:
         numbers = np.array(everything, dtype=float)
         edges = np.histogram_bin_edges(numbers, BINS)
         counts = [np.histogram(np.array(part, dtype=float), edges)[0] for part in (kept, everything)]
-        names = [f"{low:g} to {high:g}" for low, high in zip(edges, edges[1:], strict=False)]
+        names = [f"{low:g} to {high:g}" for low, high in pairwise(edges)]
         pairs = list(zip(names, *(c.tolist() for c in counts), strict=True))
     else:
         among, total = Counter(kept), Counter(everything)

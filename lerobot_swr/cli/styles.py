@@ -47,8 +47,8 @@ class StylesCommand:
     rows: int = 10
     # Write the interactive map into this HTML file.
     map: Path | None = None
-    # The training dataset, for the map, for --add, and to make the table anew; null takes the dataset that the
-    # checkpoint's train_config.json names.
+    # The training dataset, for the map and for --add; giving it makes the table anew. null takes the dataset
+    # that the checkpoint's train_config.json names.
     dataset: DatasetSource = field(default_factory=DatasetSource)
     # Make the table anew with this rule for the column "behavior": module:function.
     behavior_rule: str | None = None
@@ -140,8 +140,9 @@ def _make_table_anew(cfg: StylesCommand, config: ZBCConfig) -> None:
     config.style_metrics = cfg.style_metrics or config.style_metrics
     if config.num_added_styles:
         raise ValueError(
-            f"checkpoint={str(cfg.checkpoint)!r} has {config.num_added_styles} added styles, whose demonstrations "
-            "are not in the training dataset: make the table of the original checkpoint anew, then add them"
+            f"checkpoint={str(cfg.checkpoint)!r} has {config.num_added_styles} added styles, whose "
+            "demonstrations are not in the training dataset: make the table of the original checkpoint anew, "
+            "then add them"
         )
     checkpoint = load_checkpoint(config)
     load_reference(cfg.dataset, checkpoint)  # refuses another dataset
