@@ -5,7 +5,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_swr.similarity import Normalization, check_beta, check_normalization
 
@@ -33,8 +33,8 @@ class SimilarityWeightedSampler:
     """Draws pairs (i, j) for given episodes i, with j ≠ i at probability p.
 
     ``uniform`` draws j uniformly and weights the loss by W(τ_i, τ_j), as the paper does; ``weighted`` draws
-    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and spares the variance of the weights. Draws
-    come from torch's global generator, which LeRobot saves and restores with a checkpoint.
+    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and spares the variance of
+    the weights.
 
     Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.
     The normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
@@ -89,26 +89,29 @@ class SimilarityWeightedSampler:
         largest = self._largest[i]
         return torch.where(largest > 0, self._distances[i, j] / largest, 0.0)
 
-    def draw(self, episodes: Tensor) -> Pairs:
+    def draw(self, episodes: Tensor, generator: torch.Generator) -> Pairs:
         """Draw a partner for every frame.
 
         Args:
             episodes: (B,) int64, episode i of each frame; all of them candidates.
+            generator: Source of the draws, on the CPU.
         """
         others = len(self._candidate_list) - 1
         if self.p == 0 or others < 1:
             ones = torch.ones(len(episodes), device=episodes.device)
             return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
-        relabelled = torch.rand(len(episodes), device=episodes.device) < self.p
+        relabelled = torch.rand(len(episodes), generator=generator).to(episodes.device) < self.p
         if self.partner_sampling == "uniform":
-            place = torch.randint(others, episodes.shape, device=episodes.device)
+            place = torch.randint(others, episodes.shape, generator=generator).to(episodes.device)
             place = place + (place >= self._place[episodes])  # skips the frame's own episode
             partners = self._candidate_list[place]
             weights = torch.exp(-self.beta * self.nu(episodes, partners))
         else:
             log_weights = -self.beta * self.nu(episodes[:, None], self._candidate_list)  # (B, M)
             log_weights[torch.arange(len(episodes)), self._place[episodes]] = -torch.inf
-            partners = self._candidate_list[torch.multinomial(log_weights.softmax(dim=1), 1).squeeze(1)]
+            shares = log_weights.softmax(dim=1).cpu()
+            place = torch.multinomial(shares, 1, generator=generator).squeeze(1).to(episodes.device)
+            partners = self._candidate_list[place]
             weights = log_weights.logsumexp(dim=1).exp() / others
         return Pairs(
             torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
@@ -123,6 +126,30 @@ class SimilarityWeightedSampler:
         styles = self._candidate_list[::stride]
         weights = torch.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
         return float((weights.sum(dim=0).square() / weights.square().sum(dim=0)).mean())
+
+
+class StepGenerator(nn.Module):
+    """A fresh random generator for every training step, a pure function of seed, process and step.
+
+    Seed and step are buffers, so they travel with a checkpoint and a resumed run draws what the uninterrupted
+    one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making a
+    data loader's iterator draws from it, once more in a resumed run than in one that goes on.)
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seed: Tensor
+        self.step: Tensor
+        self.register_buffer("seed", torch.tensor(torch.initial_seed() % 2**63))
+        self.register_buffer("step", torch.tensor(0))
+
+    def next(self) -> torch.Generator:
+        """The generator of the next step, on the CPU."""
+        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
+        process = torch.distributed.get_rank() if distributed else 0
+        entropy = np.random.SeedSequence((int(self.seed), process, int(self.step)))
+        self.step += 1
+        return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint32)[0]))
 
 
 def check_probability(p: float) -> None:

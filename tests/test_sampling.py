@@ -10,6 +10,8 @@ from lerobot_swr.similarity import normalize_distances
 N = 5
 DISTANCES = np.abs(np.subtract.outer(np.array([0.0, 1, 3, 7, 8]), np.array([0.0, 1, 3, 7, 8])))
 
+GENERATOR = torch.Generator()
+
 
 def make_sampler(**options) -> SimilarityWeightedSampler:
     sampler = SimilarityWeightedSampler(DISTANCES, **{"beta": 2.0, "p": 1.0, **options})
@@ -20,9 +22,9 @@ def make_sampler(**options) -> SimilarityWeightedSampler:
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_partners_are_other_episodes_at_the_relabelling_probability(partner_sampling):
     """A relabelled frame has j ≠ i, another keeps j = i and weight 1; the share of the former is p."""
-    torch.manual_seed(0)
+    GENERATOR.manual_seed(0)
     episodes = torch.arange(20_000) % N
-    pairs = make_sampler(p=0.3, partner_sampling=partner_sampling).draw(episodes)
+    pairs = make_sampler(p=0.3, partner_sampling=partner_sampling).draw(episodes, GENERATOR)
     assert ((pairs.styles != episodes) == pairs.relabelled).all()
     assert (pairs.weights[~pairs.relabelled] == 1).all()
     assert abs(pairs.relabelled.float().mean() - 0.3) < 0.02
@@ -30,7 +32,7 @@ def test_partners_are_other_episodes_at_the_relabelling_probability(partner_samp
 
 def test_both_ways_of_drawing_have_the_expectation_of_the_formula():
     """E[weight · f(i, j)] = mean over j ≠ i of W(i, j) f(i, j), for uniform and for weighted drawing."""
-    torch.manual_seed(0)
+    GENERATOR.manual_seed(0)
     values = torch.rand(N, N)
     weights = np.exp(-2.0 * normalize_distances(DISTANCES, "row"))
     draws = 100_000
@@ -38,7 +40,7 @@ def test_both_ways_of_drawing_have_the_expectation_of_the_formula():
         others = [j for j in range(N) if j != i]
         expected = np.mean([weights[i, j] * float(values[i, j]) for j in others])
         for way in ("uniform", "weighted"):
-            pairs = make_sampler(partner_sampling=way).draw(torch.full((draws,), i))
+            pairs = make_sampler(partner_sampling=way).draw(torch.full((draws,), i), GENERATOR)
             samples = pairs.weights * values[i, pairs.styles]
             assert abs(samples.mean() - expected) < 5 * samples.std() / np.sqrt(draws) + 1e-6
         # Weighted drawing leaves the loss as the only source of variance: the weight is the row's mean.
@@ -48,27 +50,27 @@ def test_both_ways_of_drawing_have_the_expectation_of_the_formula():
 @pytest.mark.parametrize("normalization", ["row", "global"])
 def test_uniform_weights_equal_the_weight_matrix(normalization):
     """Each pair's weight is W(i, j) = exp(−β ν(i, j)), computed here from the distances."""
-    torch.manual_seed(0)
+    GENERATOR.manual_seed(0)
     weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
     episodes = torch.arange(500) % N
-    pairs = make_sampler(normalization=normalization).draw(episodes)
+    pairs = make_sampler(normalization=normalization).draw(episodes, GENERATOR)
     np.testing.assert_allclose(pairs.weights, weights[episodes, pairs.styles], rtol=1e-5)
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_without_temperature_every_weight_is_one(partner_sampling):
     """β = 0 is BC-like: all demonstrations teach all styles alike."""
-    pairs = make_sampler(beta=0.0, partner_sampling=partner_sampling).draw(torch.arange(1000) % N)
+    pairs = make_sampler(beta=0.0, partner_sampling=partner_sampling).draw(torch.arange(1000) % N, GENERATOR)
     torch.testing.assert_close(pairs.weights, torch.ones(1000))
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_only_candidates_are_drawn_and_normalise(partner_sampling):
     """Episodes outside the training data are no partners, and the farthest candidate is at ν = 1."""
-    torch.manual_seed(0)
+    GENERATOR.manual_seed(0)
     sampler = make_sampler(partner_sampling=partner_sampling)
     sampler.set_candidates(torch.tensor([1, 0, 1, 1, 0]))
-    pairs = sampler.draw(torch.tensor([0, 2, 3]).repeat(300))
+    pairs = sampler.draw(torch.tensor([0, 2, 3]).repeat(300), GENERATOR)
     assert set(pairs.styles.tolist()) == {0, 2, 3}
     assert float(sampler.nu(torch.tensor(0), torch.tensor(3))) == 1.0
 
@@ -76,7 +78,7 @@ def test_only_candidates_are_drawn_and_normalise(partner_sampling):
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_a_huge_temperature_gives_zero_weights_and_no_nan(partner_sampling):
     """β where exp(−β) underflows leaves relabelled frames with weight 0, not with NaN."""
-    pairs = make_sampler(beta=1e6, partner_sampling=partner_sampling).draw(torch.arange(50) % N)
+    pairs = make_sampler(beta=1e6, partner_sampling=partner_sampling).draw(torch.arange(50) % N, GENERATOR)
     assert (pairs.weights == 0).all()
 
 
@@ -84,7 +86,7 @@ def test_a_single_candidate_keeps_its_frames():
     """With nobody else to teach, frames keep their own style."""
     sampler = make_sampler()
     sampler.set_candidates(torch.tensor([0, 1, 0, 0, 0]))
-    pairs = sampler.draw(torch.tensor([1, 1]))
+    pairs = sampler.draw(torch.tensor([1, 1]), GENERATOR)
     assert pairs.styles.tolist() == [1, 1]
     assert not pairs.relabelled.any()
 

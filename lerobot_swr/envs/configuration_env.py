@@ -69,5 +69,6 @@ class TaskEnvConfig(EnvConfig):
 
 
 def _make_one(config: TaskEnvConfig) -> gym.Env:
-    """One sub-environment. The configuration goes along so that a worker process registers its Gymnasium id."""
+    """One sub-environment. The configuration goes along so that a worker process registers its Gymnasium
+    id."""
     return gym.make(config.gym_id, disable_env_checker=config.disable_env_checker, **config.gym_kwargs)

@@ -103,7 +103,7 @@ def plot_blends(
             for k in chosen:
                 record = result.episodes[k]
                 style = "-" if record["success"] else ":"
-                axes.plot(*paths[k].T, style, color=colors(0.9 * record["share"]), linewidth=1.8)
+                axes.plot(*paths[k].T, style, color=colors(record["share"]), linewidth=1.8)
             i, j = result.episodes[chosen[0]]["episodes"]
             ends = result.episodes[chosen[0]]["ends"]
             axes.set_title(f"{kind}: {i} ({ends[0]}) to {j} ({ends[1]})", fontsize=10)
@@ -118,7 +118,7 @@ def plot_blends(
     for row in range(2, examples):
         grid[row, -1].set_axis_off()
     scale = ScalarMappable(cmap=colors)
-    scale.set_clim(0, 1 / 0.9)
+    scale.set_clim(0, 1)
     figure.colorbar(
         scale, ax=grid[:, :-1], shrink=0.5, label="share of the second style (dotted: no success)"
     )

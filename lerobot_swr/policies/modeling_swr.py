@@ -20,7 +20,7 @@ from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.network import ActionNetwork
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
-from lerobot_swr.sampling import SimilarityWeightedSampler
+from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import cached_distances
 from lerobot_swr.style_encoding import Frames, encode_styles
 from lerobot_swr.style_selection import StyleSelection
@@ -422,6 +422,7 @@ class WZBCPolicy(ZBCPolicy):
 
     def __init__(self, config: WZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
+        self.draws = StepGenerator()
         self.sampler: SimilarityWeightedSampler | None = None
         if dataset_meta is not None:
             if len(self.styles) < 2:
@@ -463,7 +464,7 @@ class WZBCPolicy(ZBCPolicy):
         episodes = batch["episode_index"]
         self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
-        pairs = self.sampler.draw(episodes)
+        pairs = self.sampler.draw(episodes, self.draws.next())
         style = self.styles.embedding(pairs.styles)
         style = torch.where(pairs.relabelled[:, None], style.detach(), style)
         errors = self._action_errors(self.network(batch, style), batch)

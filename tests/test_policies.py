@@ -1,0 +1,365 @@
+"""The policies bc, zbc and wzbc as LeRobot sees them."""
+
+import copy
+import importlib.metadata
+import json
+import logging
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from conftest import make_batch, save_checkpoint
+from huggingface_hub import ModelCard
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_policy_config
+
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.policies.modeling_swr import ZBCPolicy
+
+STYLE_POLICIES = ("zbc", "wzbc")
+
+
+def gradients(policy, batch):
+    policy.train()
+    policy.zero_grad()
+    loss, figures = policy.forward(batch)
+    loss.backward()
+    return loss.item(), {name: p.grad for name, p in policy.named_parameters()}, figures
+
+
+def drawn_pairs(policy, batch):
+    """The pairs that the policy's next training step will draw."""
+    policy.sampler.set_candidates(policy.styles.trained)
+    return policy.sampler.draw(batch["episode_index"], copy.deepcopy(policy.draws).next())
+
+
+def reload(policy, meta, folder, **overrides):
+    save_checkpoint(policy, meta, folder)
+    flags = [f"--{key}={value}" for key, value in overrides.items()]
+    config = PreTrainedConfig.from_pretrained(folder, cli_overrides=flags)
+    return get_policy_class(config.type).from_pretrained(folder, config=config)
+
+
+def train_briefly(policy, steps=20, seed=0):
+    torch.manual_seed(seed)
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    for step in range(steps):
+        loss, _ = policy.forward(make_batch(seed=step))
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    return policy.eval()
+
+
+def test_lerobot_discovers_the_distribution_by_its_exact_name():
+    """The metadata name is the importable shim's, underscores and all."""
+    names = [d.metadata["Name"] for d in importlib.metadata.distributions()]
+    assert "lerobot_policy_swr" in names
+    assert {"bc", "zbc", "wzbc"} <= set(PreTrainedConfig.get_known_choices())
+
+
+@pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
+def test_always_relabelling_sends_no_gradient_into_any_style(make_tiny_policy, partner_sampling):
+    """p = 1: the network learns, the styles' gradient is exactly zero (stop-gradient of algorithm 1)."""
+    policy = make_tiny_policy("wzbc", p=1.0, partner_sampling=partner_sampling)
+    _, grads, _ = gradients(policy, make_batch())
+    style = grads.pop("styles.embedding.weight")
+    assert style is None or (style == 0).all()
+    assert all((grad != 0).any() for grad in grads.values())
+
+
+def test_styles_learn_from_their_own_frames_alone(make_tiny_policy):
+    """The style gradient of a mixed batch equals that of its own-style frames, computed by hand."""
+    policy = make_tiny_policy("wzbc", p=0.5, balance_episodes=False)
+    batch = make_batch()
+    policy.styles.mark_trained(batch["episode_index"])
+    pairs = drawn_pairs(policy, batch)
+    _, grads, _ = gradients(policy, batch)
+    assert 0 < pairs.relabelled.sum() < len(pairs.relabelled)
+    policy.zero_grad()
+    own = {key: value[~pairs.relabelled] for key, value in batch.items()}
+    predicted = policy.network(own, policy.styles.embedding(own["episode_index"]))
+    ((predicted - own["action"]) ** 2).mean(dim=1).sum().div(len(pairs.relabelled)).backward()
+    torch.testing.assert_close(policy.styles.embedding.weight.grad, grads["styles.embedding.weight"])
+
+
+def test_without_relabelling_wzbc_is_zbc_bit_for_bit(make_tiny_policy):
+    """p = 0: same initial weights, same weights after training."""
+    zbc, wzbc = make_tiny_policy("zbc"), make_tiny_policy("wzbc", p=0.0)
+    train_briefly(zbc)
+    train_briefly(wzbc)
+    for name, value in zbc.state_dict().items():
+        assert torch.equal(value, wzbc.state_dict()[name]), name
+
+
+def test_without_temperature_relabelled_frames_count_fully(make_tiny_policy):
+    """β = 0: every weight is 1, so the mean weight is the share of relabelled frames over p."""
+    policy = make_tiny_policy("wzbc", beta=0.0, p=1.0)
+    _, _, figures = gradients(policy, make_batch())
+    assert figures["mean_weight"] == pytest.approx(1)
+    assert figures["effective_demos"] == pytest.approx(6)
+
+
+def test_the_logged_figures_average_to_the_losses_they_name(make_tiny_policy):
+    """Own-style and relabelled loss and mean weight, against sums over the drawn pairs."""
+    policy = make_tiny_policy("wzbc", p=0.5, balance_episodes=False)
+    batch = make_batch(n_frames=6000)
+    policy.styles.mark_trained(batch["episode_index"])
+    policy.train()
+    pairs = drawn_pairs(policy, batch)
+    losses, figures = policy.forward(batch, reduction="none")
+    errors = losses.detach() / pairs.weights
+    assert figures["own_style_loss"] == pytest.approx(errors[~pairs.relabelled].mean().item(), rel=0.05)
+    assert figures["relabelled_loss"] == pytest.approx(errors[pairs.relabelled].mean().item(), rel=0.05)
+    assert figures["mean_weight"] == pytest.approx(pairs.weights[pairs.relabelled].mean().item(), rel=0.05)
+    assert policy.forward(batch)[0].ndim == 0
+
+
+def test_balanced_frames_count_every_episode_alike(make_tiny_policy, small_maze_meta):
+    """Frame losses are weighted by mean length / length."""
+    lengths = np.array(small_maze_meta.episodes["length"])
+    batch = make_batch()
+    plain = make_tiny_policy("bc", balance_episodes=False).forward(batch, reduction="none")[0]
+    balanced = make_tiny_policy("bc").forward(batch, reduction="none")[0]
+    expected = lengths.mean() / lengths[batch["episode_index"]]
+    np.testing.assert_allclose((balanced / plain).detach(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("policy_type", ["bc", *STYLE_POLICIES])
+def test_saving_and_loading_keeps_the_actions(make_tiny_policy, small_maze_meta, tmp_path, policy_type):
+    """The same observations and random state give the same actions."""
+    policy = train_briefly(make_tiny_policy(policy_type))
+    loaded = reload(policy, small_maze_meta, tmp_path / "checkpoint")
+    batch = make_batch(10)
+    for candidate in (policy, loaded):
+        candidate.reset()
+    torch.manual_seed(5)
+    expected = policy.select_action(batch)
+    torch.manual_seed(5)
+    assert torch.equal(loaded.select_action(batch), expected)
+    assert torch.equal(loaded.predict_action_chunk(batch)[:, 0], expected)
+
+
+@pytest.mark.parametrize("policy_type", STYLE_POLICIES)
+def test_styles_are_constant_in_an_episode_and_independent_across_environments(
+    make_tiny_policy, policy_type
+):
+    """Each environment acts with its one style, drawn for itself, whatever the others do."""
+    policy = train_briefly(make_tiny_policy(policy_type))
+    observations = make_batch(64)
+    policy.reset()
+    policy.select_action(observations)
+    styles = policy.styles.active.clone()
+    for seed in range(3):
+        step = make_batch(64, seed=seed)
+        expected = policy.network(step, policy.styles.embedding(styles))
+        torch.testing.assert_close(policy.select_action(step), expected)
+    assert torch.equal(policy.styles.active, styles)
+    assert len(styles.unique()) == 6
+    policy.reset()
+    policy.select_action(observations)
+    assert not torch.equal(policy.styles.active, styles)
+
+
+def test_inference_options_are_flags_of_the_loaded_policy(make_tiny_policy, small_maze_meta, tmp_path):
+    """A loaded checkpoint takes style_sampling and style_episodes."""
+    policy = train_briefly(make_tiny_policy("zbc"))
+    loaded = reload(
+        policy, small_maze_meta, tmp_path / "c", style_sampling="fixed", style_episodes="[3,1]"
+    )
+    loaded.reset()
+    loaded.select_action(make_batch(3))
+    assert loaded.styles.active.tolist() == [3, 1, 3]
+
+
+def test_only_trained_episodes_are_drawn_after_loading(make_tiny_policy, small_maze_meta, tmp_path):
+    """The checkpoint remembers which episodes were trained."""
+    policy = make_tiny_policy("wzbc")
+    policy.train()
+    batch = make_batch()
+    batch["episode_index"] = torch.where(batch["episode_index"] > 3, 1, batch["episode_index"])
+    policy.forward(batch)
+    loaded = reload(policy, small_maze_meta, tmp_path / "c")
+    loaded.reset()
+    loaded.select_action(make_batch(200))
+    assert set(loaded.styles.active.tolist()) == {0, 1, 2, 3}
+
+
+def test_fine_tuning_on_other_data_keeps_the_network_and_starts_new_styles(
+    make_tiny_policy, small_maze_meta, tmp_path, caplog
+):
+    """Another dataset, of another size: network kept, cookbook new, a message says so."""
+    policy = train_briefly(make_tiny_policy("zbc"))
+    save_checkpoint(policy, small_maze_meta, tmp_path / "c")
+    write_dataset(_recipe("other", "small", {"20": 3}, steady), tmp_path / "other", seed=9)
+    config = PreTrainedConfig.from_pretrained(tmp_path / "c")
+    config.pretrained_path = tmp_path / "c"
+    with caplog.at_level(logging.WARNING):
+        tuned = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/other", root=tmp_path / "other"))
+    assert "3 new styles" in caplog.text
+    assert len(tuned.styles) == 3
+    assert tuned.styles.trained.sum() == 0
+    assert torch.equal(tuned.network.head.weight, policy.network.head.weight)
+
+
+def test_continuing_on_the_same_data_keeps_the_styles(make_tiny_policy, small_maze_meta, tmp_path):
+    """A checkpoint with its own dataset is continued, styles and all."""
+    policy = train_briefly(make_tiny_policy("wzbc"))
+    save_checkpoint(policy, small_maze_meta, tmp_path / "c")
+    config = PreTrainedConfig.from_pretrained(tmp_path / "c")
+    config.pretrained_path = tmp_path / "c"
+    loaded = make_policy(config, ds_meta=small_maze_meta)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(value, loaded.state_dict()[name]), name
+
+
+def test_constant_dimensions_are_centred_not_blown_up(make_tiny_policy, small_maze_meta):
+    """The goal never moves; its input is 0, not the rounding error of its mean over 1e-8."""
+    policy = make_tiny_policy("bc")
+    stats = {key: dict(value) for key, value in small_maze_meta.stats.items()}
+    stats["observation.environment_state"]["std"] = np.zeros(2)
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=stats)
+    goal = torch.tensor([[0.5, 0.92]])
+    batch = preprocessor(
+        {"observation.state": goal, "observation.environment_state": goal, "action": goal}
+    )
+    assert batch["observation.environment_state"].abs().max() < 1e-3
+
+
+def test_the_papers_literal_network_is_one_flag_set():
+    """Plain layers, constant learning rate, unit styles, no normalisation."""
+    config = make_policy_config(
+        "wzbc",
+        residual=False,
+        lr_schedule="constant",
+        style_init_scale=1.0,
+        normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"},
+        device="cpu",
+    )
+    assert config.get_scheduler_preset() is None
+    assert (config.hidden_dim, config.num_hidden, config.style_dim) == (128, 10, 10)
+    assert (config.beta, config.p, config.optimizer_lr) == (10.0, 0.8, 1e-3)
+
+
+@pytest.mark.parametrize("steps", [7, 400, 10_000])
+def test_the_learning_rate_ends_at_zero_at_the_last_step(make_tiny_policy, steps):
+    """Whatever the number of steps."""
+    policy = make_tiny_policy("bc")
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    scheduler = policy.config.get_scheduler_preset().build(optimizer, steps)
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(1e-3)
+    optimizer.step()
+    for _ in range(steps):
+        scheduler.step()
+    assert optimizer.param_groups[0]["lr"] == pytest.approx(0, abs=1e-12)
+
+
+def test_the_model_card_says_how_to_install_the_plugin(make_tiny_policy, monkeypatch):
+    """Whoever finds the policy on the Hub can run it (the Hub's own check of the card needs the Hub)."""
+    monkeypatch.setattr(ModelCard, "validate", lambda card: None)
+    card = make_tiny_policy("zbc").generate_model_card("local/small_maze", "zbc", None, None)
+    assert "pip install lerobot_policy_swr" in card.text
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "options", "message"),
+    [
+        ("wzbc", {"p": 1.2}, "p=1.2"),
+        ("wzbc", {"beta": -3}, "beta=-3"),
+        ("wzbc", {"partner_sampling": "x"}, "partner_sampling='x'"),
+        ("wzbc", {"similarity_normalization": "x"}, "normalization='x'"),
+        ("zbc", {"style_sampling": "some"}, "style_sampling='some'"),
+        ("zbc", {"style_dim": 0}, "style_dim=0"),
+        ("bc", {"num_hidden": 0}, "num_hidden=0"),
+        ("bc", {"lr_schedule": "linear"}, "lr_schedule='linear'"),
+    ],
+)
+def test_bad_values_are_named_when_the_configuration_is_made(policy_type, options, message):
+    """Before a dataset is even looked at."""
+    with pytest.raises(ValueError, match=message):
+        make_policy_config(policy_type, device="cpu", **options)
+
+
+def test_unknown_similarity_keys_are_named(make_tiny_policy):
+    """The features to choose from are listed."""
+    with pytest.raises(ValueError, match=r"similarity_keys=\['observation.speed'\].*observation.state"):
+        make_tiny_policy("wzbc", similarity_keys=["observation.speed"])
+
+
+def test_a_single_episode_is_too_few_for_wzbc(tmp_path):
+    """wzbc says what to do; zbc trains on it."""
+    write_dataset(_recipe("one", "small", {"10": 1}, steady), tmp_path / "one")
+    meta = LeRobotDatasetMetadata("local/one", root=tmp_path / "one")
+    with pytest.raises(ValueError, match=r"single episode.*--policy.type=zbc"):
+        make_policy(make_policy_config("wzbc", device="cpu"), ds_meta=meta)
+    assert len(make_policy(make_policy_config("zbc", device="cpu"), ds_meta=meta).styles) == 1
+
+
+def test_a_dataset_without_state_is_refused(small_maze_meta):
+    """The missing feature is named."""
+    config = make_policy_config("zbc", device="cpu")
+    features = dict(small_maze_meta.features)
+    del features["observation.state"]
+    meta = LeRobotDatasetMetadata("local/small_maze", root=small_maze_meta.root)
+    meta.info["features"] = features
+    with pytest.raises(ValueError, match=r"needs the feature 'observation.state'"):
+        make_policy(config, ds_meta=meta)
+
+
+def test_nan_states_are_refused_before_training(small_maze, tmp_path):
+    """Also for data of any other source: the parquet file is edited here."""
+    import shutil
+
+    root = tmp_path / "broken"
+    shutil.copytree(small_maze, root)
+    file = next((root / "data").rglob("*.parquet"))
+    table = pd.read_parquet(file)
+    table.at[10, "observation.state"] = np.array([np.nan, 0.0], dtype=np.float32)
+    table.to_parquet(file)
+    meta = LeRobotDatasetMetadata("local/broken", root=root)
+    with pytest.raises(ValueError, match="'observation.state' is NaN.*episode 0, frame 10"):
+        make_policy(make_policy_config("bc", device="cpu"), ds_meta=meta)
+
+
+@pytest.mark.parametrize("damage", ["truncated", "missing tensor", "other size"])
+def test_a_damaged_checkpoint_is_an_error(make_tiny_policy, small_maze_meta, tmp_path, damage):
+    """Weights that are cut off, incomplete or of another shape are never silently replaced by random ones."""
+    policy = make_tiny_policy("zbc")
+    folder = save_checkpoint(policy, small_maze_meta, tmp_path / "c")
+    weights = folder / "model.safetensors"
+    if damage == "truncated":
+        weights.write_bytes(weights.read_bytes()[:-100])
+    elif damage == "missing tensor":
+        from safetensors.torch import load_file, save_file
+
+        tensors = load_file(weights)
+        del tensors["styles.embedding.weight"]
+        save_file(tensors, weights)
+    else:
+        config = json.loads((folder / "config.json").read_text())
+        config["num_episodes"] = 7
+        (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"model.safetensors.*(damaged checkpoint|does not fit)"):
+        ZBCPolicy.from_pretrained(folder)
+
+
+def test_a_style_policy_needs_a_dataset_or_a_checkpoint():
+    """From an environment alone there is nothing to have styles of."""
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    config = make_policy_config(
+        "zbc",
+        device="cpu",
+        input_features={"observation.state": PolicyFeature(FeatureType.STATE, (2,))},
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (2,))},
+    )
+    with pytest.raises(ValueError, match="one style per episode"):
+        ZBCPolicy(config)

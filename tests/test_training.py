@@ -1,0 +1,113 @@
+"""LeRobot's own training command with this plugin: resume, subsets, several processes, refusals."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import train_flags
+from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import get_policy_class
+from safetensors.torch import load_file
+
+SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2")
+
+
+def weights(output_dir: Path, step: int) -> dict[str, torch.Tensor]:
+    """The saved tensors of a run's checkpoint."""
+    return load_file(output_dir / "checkpoints" / f"{step:06d}" / "pretrained_model" / "model.safetensors")
+
+
+def load(output_dir: Path):
+    """The last policy of a run."""
+    folder = output_dir / "checkpoints" / "last" / "pretrained_model"
+    config = PreTrainedConfig.from_pretrained(folder)
+    return get_policy_class(config.type).from_pretrained(folder, config=config)
+
+
+@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
+def test_a_killed_run_resumes_to_the_same_weights(lerobot_train_command, small_maze, tmp_path, policy_type):
+    """Uninterrupted: 30 steps. Killed after step 10 and resumed: the same weights, bit for bit."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    flags = [*SMALL, "--save_freq=10", "--log_freq=5"]
+    lerobot_train_command(*train_flags(policy_type, small_maze, whole, 30, *flags))
+    shutil.copytree(whole, killed, symlinks=True)
+    for step in (20, 30):
+        shutil.rmtree(killed / "checkpoints" / f"{step:06d}")
+    config = killed / "checkpoints" / "000010" / "pretrained_model" / "train_config.json"
+    config.write_text(config.read_text().replace(str(whole), str(killed)))
+    lerobot_train_command(f"--config_path={config}", "--resume=true")
+    expected, resumed = weights(whole, 30), weights(killed, 30)
+    assert expected.keys() == resumed.keys()
+    for name, value in expected.items():
+        assert torch.equal(value, resumed[name]), name
+
+
+def test_training_on_a_subset_draws_only_its_styles(lerobot_train_command, small_maze, tmp_path):
+    """--dataset.episodes: the other episodes' styles stay untouched and are never drawn."""
+    flags = [*SMALL, "--dataset.episodes=[1,4,5]"]
+    lerobot_train_command(*train_flags("wzbc", small_maze, tmp_path / "run", 60, *flags))
+    policy = load(tmp_path / "run")
+    assert policy.styles.trained.tolist() == [0, 1, 0, 0, 1, 1]
+    assert set(policy.styles.draw(300).tolist()) == {1, 4, 5}
+
+
+def test_held_out_episodes_give_a_loss_and_no_style(lerobot_train_command, small_maze, tmp_path):
+    """--dataset.eval_split: the held-out loss is computed, the held-out episodes are not trained."""
+    flags = [*SMALL, "--dataset.eval_split=0.3", "--eval_steps=20", "--log_freq=20"]
+    lerobot_train_command(*train_flags("zbc", small_maze, tmp_path / "run", 40, *flags))
+    assert load(tmp_path / "run").styles.trained.tolist() == [1, 1, 1, 1, 0, 0]
+
+
+def test_training_figures_are_logged(lerobot_train_command, small_maze, tmp_path, capfd):
+    """Loss and the method's own figures reach LeRobot's log."""
+    lerobot_train_command(*train_flags("wzbc", small_maze, tmp_path / "run", 10, *SMALL, "--log_freq=10"))
+    logged = "".join(capfd.readouterr())
+    for name in ("loss:", "own_style_loss:", "relabelled_loss:", "mean_weight:", "effective_demos:"):
+        assert re.search(rf"\b{name}[\d.]+", logged), name
+
+
+def test_two_processes_train_one_cookbook(small_maze, tmp_path):
+    """accelerate with 2 processes: the saved checkpoint knows every episode that either process saw."""
+    output_dir = tmp_path / "run"
+    command = [
+        *("-m", "accelerate.commands.launch", "--cpu", "--num_processes=2", "--num_machines=1"),
+        *("--mixed_precision=no", "--dynamo_backend=no", "--main_process_port=0"),
+        str(Path(sys.executable).with_name("lerobot-train")),
+        *train_flags("wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5"),
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    run = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr[-3000:]
+    policy = load(output_dir)
+    assert policy.styles.trained.all()
+    assert "Effective batch size: 8 x 2 = 16" in run.stdout + run.stderr
+
+
+def test_resuming_on_another_dataset_is_refused(lerobot_train_command, small_maze, tmp_path):
+    """The dataset on disk changed since: an error names both sizes, before any step."""
+    from lerobot_swr.demos.dataset_writer import write_dataset
+    from lerobot_swr.demos.maze2d import _recipe, steady
+
+    output_dir, other = tmp_path / "run", tmp_path / "other"
+    lerobot_train_command(*train_flags("zbc", small_maze, output_dir, 4, *SMALL, "--save_freq=2"))
+    write_dataset(_recipe("other", "small", {"10": 3}, steady), other)
+    config = output_dir / "checkpoints" / "000002" / "pretrained_model" / "train_config.json"
+    with pytest.raises(ValueError, match=r"dataset.root=.*3 episodes.*checkpoint \(6 episodes"):
+        lerobot_train_command(f"--config_path={config}", "--resume=true", f"--dataset.root={other}")
+
+
+def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_command, small_maze, tmp_path):
+    """The flag set of docs/method.md trains."""
+    flags = [
+        "--policy.residual=false",
+        "--policy.lr_schedule=constant",
+        "--policy.style_init_scale=1.0",
+        '--policy.normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}',
+    ]
+    lerobot_train_command(*train_flags("wzbc", small_maze, tmp_path / "run", 2, *flags))
+    assert not load(tmp_path / "run").config.residual
