@@ -5,6 +5,8 @@ import os
 import sys
 from collections.abc import Callable
 
+from draccus.utils import ParsingError
+
 
 def explain_errors(command: Callable[[], None]) -> Callable[[], None]:
     """Print the message of an input error and exit with status 2 instead of showing a stack trace.
@@ -16,10 +18,12 @@ def explain_errors(command: Callable[[], None]) -> Callable[[], None]:
     def wrapper() -> None:
         try:
             command()
-        except (ValueError, OSError) as error:
+        except (ValueError, OSError, ParsingError) as error:
             if os.environ.get("LEROBOT_SWR_DEBUG"):
                 raise
-            print(f"error: {error}", file=sys.stderr)
+            # The parser wraps what a configuration's own checks say.
+            told = error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error
+            print(f"error: {told}", file=sys.stderr)
             sys.exit(2)
 
     return wrapper

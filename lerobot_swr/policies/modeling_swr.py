@@ -438,6 +438,11 @@ class WZBCPolicy(ZBCPolicy):
                 config.partner_sampling,  # type: ignore[arg-type]
             )
 
+    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Checkpoints from before the draws' seed was kept start a new sequence of draws."""
+        draws = {f"draws.{key}": value for key, value in self.draws.state_dict().items()}
+        return {**draws, **super()._translate_checkpoint(state)}
+
     def compared_keys(self) -> Sequence[str]:
         """The features over which ν compares demonstrations.
 
