@@ -1,5 +1,6 @@
 """The similarity-weighted sampler: draws whose style a frame teaches (algorithm 1)."""
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,7 +21,7 @@ class Pairs:
 
     Attributes:
         styles: (B,) int64, episode j whose style is used; j = i where the frame is not relabelled.
-        weights: (B,) weight of the frame's loss: W(τ_i, τ_j), or 1 where it is not relabelled.
+        weights: (B,) weight of the frame's loss.
         relabelled: (B,) bool, True where j ≠ i: no gradient may flow into z_j there.
     """
 
@@ -30,11 +31,12 @@ class Pairs:
 
 
 class SimilarityWeightedSampler:
-    """Draws pairs (i, j) for given episodes i, with j ≠ i at probability p.
+    """Draws pairs (i, j) for given episodes i, so that on average a style j learns as algorithm 1 has it.
 
-    ``uniform`` draws j uniformly and weights the loss by W(τ_i, τ_j), as the paper does; ``weighted`` draws
-    j ∝ W(τ_i, ·) and weights by the row's mean, which has the same expectation and spares the variance of
-    the weights.
+    ``uniform`` is the paper's way: j ≠ i uniformly at probability p, weighted by W(τ_i, τ_j), else j = i. Where
+    demonstrations differ, W is almost 0 and so a share p of the batch teaches almost nothing. ``weighted`` draws
+    the pair by its share in the same expectation, 1 - p for j = i and p W(τ_i, τ_j) / (M - 1) for each of the
+    M - 1 others, and weights every frame by the sum of these shares: no frame is wasted.
 
     Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.
     The normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
@@ -100,22 +102,22 @@ class SimilarityWeightedSampler:
         if self.p == 0 or others < 1:
             ones = torch.ones(len(episodes), device=episodes.device)
             return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
-        relabelled = torch.rand(len(episodes), generator=generator).to(episodes.device) < self.p
         if self.partner_sampling == "uniform":
+            relabelled = torch.rand(len(episodes), generator=generator).to(episodes.device) < self.p
             place = torch.randint(others, episodes.shape, generator=generator).to(episodes.device)
             place = place + (place >= self._place[episodes])  # skips the frame's own episode
             partners = self._candidate_list[place]
             weights = torch.exp(-self.beta * self.nu(episodes, partners))
-        else:
-            log_weights = -self.beta * self.nu(episodes[:, None], self._candidate_list)  # (B, M)
-            log_weights[torch.arange(len(episodes)), self._place[episodes]] = -torch.inf
-            shares = log_weights.softmax(dim=1).cpu()
-            place = torch.multinomial(shares, 1, generator=generator).squeeze(1).to(episodes.device)
-            partners = self._candidate_list[place]
-            weights = log_weights.logsumexp(dim=1).exp() / others
-        return Pairs(
-            torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
-        )
+            return Pairs(
+                torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
+            )
+        # (B, M), log of each pair's share in the expectation: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i
+        log_shares = -self.beta * self.nu(episodes[:, None], self._candidate_list) + math.log(self.p / others)
+        log_own = math.log(1 - self.p) if self.p < 1 else -math.inf
+        log_shares[torch.arange(len(episodes), device=episodes.device), self._place[episodes]] = log_own
+        place = torch.multinomial(log_shares.softmax(dim=1).cpu(), 1, generator=generator).squeeze(1)
+        styles = self._candidate_list[place.to(episodes.device)]
+        return Pairs(styles, log_shares.logsumexp(dim=1).exp(), styles != episodes)
 
     def _effective_demos(self) -> float:
         """Kish's effective number of demonstrations that teach a style, from 1 (its own alone) to M.

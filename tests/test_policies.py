@@ -19,6 +19,7 @@ from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
+from lerobot_swr.similarity import normalize_distances, similarity_weights
 
 STYLE_POLICIES = ("zbc", "wzbc")
 
@@ -73,9 +74,12 @@ def test_always_relabelling_sends_no_gradient_into_any_style(make_tiny_policy, p
     assert all((grad != 0).any() for grad in grads.values())
 
 
-def test_styles_learn_from_their_own_frames_alone(make_tiny_policy):
+@pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
+def test_styles_learn_from_their_own_frames_alone(make_tiny_policy, partner_sampling):
     """The style gradient of a mixed batch equals that of its own-style frames, computed by hand."""
-    policy = make_tiny_policy("wzbc", p=0.5, balance_episodes=False)
+    policy = make_tiny_policy(
+        "wzbc", beta=1.0, p=0.5, balance_episodes=False, partner_sampling=partner_sampling
+    )
     batch = make_batch()
     policy.styles.mark_trained(batch["episode_index"])
     pairs = drawn_pairs(policy, batch)
@@ -84,7 +88,8 @@ def test_styles_learn_from_their_own_frames_alone(make_tiny_policy):
     policy.zero_grad()
     own = {key: value[~pairs.relabelled] for key, value in batch.items()}
     predicted = policy.network(own, policy.styles.embedding(own["episode_index"]))
-    ((predicted - own["action"]) ** 2).mean(dim=1).sum().div(len(pairs.relabelled)).backward()
+    errors = ((predicted - own["action"]) ** 2).mean(dim=1)
+    (errors * pairs.weights[~pairs.relabelled]).sum().div(len(pairs.relabelled)).backward()
     torch.testing.assert_close(policy.styles.embedding.weight.grad, grads["styles.embedding.weight"])
 
 
@@ -105,18 +110,32 @@ def test_without_temperature_relabelled_frames_count_fully(make_tiny_policy):
     assert figures["effective_demos"] == pytest.approx(6)
 
 
-def test_the_logged_figures_average_to_the_losses_they_name(make_tiny_policy):
-    """Own-style and relabelled loss and mean weight, against sums over the drawn pairs."""
-    policy = make_tiny_policy("wzbc", p=0.5, balance_episodes=False)
-    batch = make_batch(n_frames=6000)
+@pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
+def test_the_logged_figures_are_what_they_name(make_tiny_policy, partner_sampling):
+    """Own-style loss, relabelled loss and mean weight against the full sums over all pairs of episodes."""
+    policy = make_tiny_policy(
+        "wzbc", beta=1.0, p=0.5, partner_sampling=partner_sampling, balance_episodes=False
+    )
+    batch = make_batch(n_frames=60_000)
     policy.styles.mark_trained(batch["episode_index"])
-    policy.train()
-    pairs = drawn_pairs(policy, batch)
-    losses, figures = policy.forward(batch, reduction="none")
-    errors = losses.detach() / pairs.weights
-    assert figures["own_style_loss"] == pytest.approx(errors[~pairs.relabelled].mean().item(), rel=0.05)
-    assert figures["relabelled_loss"] == pytest.approx(errors[pairs.relabelled].mean().item(), rel=0.05)
-    assert figures["mean_weight"] == pytest.approx(pairs.weights[pairs.relabelled].mean().item(), rel=0.05)
+    _, figures = policy.train().forward(batch)
+
+    weights = similarity_weights(normalize_distances(policy.distances()), policy.config.beta)
+    frames = make_batch(n_frames=600)
+    errors = torch.stack(
+        [
+            (policy.network(frames, policy.styles.embedding.weight[j].expand(600, -1)) - frames["action"])
+            .square()
+            .mean(dim=1)
+            for j in range(6)
+        ],
+        dim=1,
+    ).detach()  # (frames, styles)
+    own = torch.nn.functional.one_hot(frames["episode_index"], 6).bool()
+    w = torch.from_numpy(weights)[frames["episode_index"]]
+    assert figures["own_style_loss"] == pytest.approx(errors[own].mean().item(), rel=0.1)
+    assert figures["relabelled_loss"] == pytest.approx((w * errors)[~own].mean().item(), rel=0.1)
+    assert figures["mean_weight"] == pytest.approx(w[~own].mean().item(), rel=0.02)
     assert policy.forward(batch)[0].ndim == 0
 
 

@@ -19,32 +19,36 @@ def make_sampler(**options) -> SimilarityWeightedSampler:
     return sampler
 
 
-@pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
-def test_partners_are_other_episodes_at_the_relabelling_probability(partner_sampling):
+def test_uniform_drawing_relabels_at_its_probability():
     """A relabelled frame has j ≠ i, another keeps j = i and weight 1; the share of the former is p."""
     GENERATOR.manual_seed(0)
     episodes = torch.arange(20_000) % N
-    pairs = make_sampler(p=0.3, partner_sampling=partner_sampling).draw(episodes, GENERATOR)
+    pairs = make_sampler(p=0.3, partner_sampling="uniform").draw(episodes, GENERATOR)
     assert ((pairs.styles != episodes) == pairs.relabelled).all()
     assert (pairs.weights[~pairs.relabelled] == 1).all()
     assert abs(pairs.relabelled.float().mean() - 0.3) < 0.02
 
 
-def test_both_ways_of_drawing_have_the_expectation_of_the_formula():
-    """E[weight · f(i, j)] = mean over j ≠ i of W(i, j) f(i, j), for uniform and for weighted drawing."""
+@pytest.mark.parametrize("p", [0.3, 0.8, 1.0])
+@pytest.mark.parametrize("normalization", ["row", "global"])
+def test_both_ways_of_drawing_have_the_expectation_of_algorithm_1(p, normalization):
+    """E[weight · f(i, j)] = (1 − p) f(i, i) + p · mean over j ≠ i of W(i, j) f(i, j)."""
     GENERATOR.manual_seed(0)
-    values = torch.rand(N, N)
-    weights = np.exp(-2.0 * normalize_distances(DISTANCES, "row"))
+    values = torch.rand(N, N, generator=GENERATOR)
+    weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
     draws = 100_000
     for i in range(N):
         others = [j for j in range(N) if j != i]
-        expected = np.mean([weights[i, j] * float(values[i, j]) for j in others])
+        relabelled = np.mean([weights[i, j] * float(values[i, j]) for j in others])
+        expected = (1 - p) * float(values[i, i]) + p * relabelled
         for way in ("uniform", "weighted"):
-            pairs = make_sampler(partner_sampling=way).draw(torch.full((draws,), i), GENERATOR)
+            sampler = make_sampler(p=p, normalization=normalization, partner_sampling=way)
+            pairs = sampler.draw(torch.full((draws,), i), GENERATOR)
             samples = pairs.weights * values[i, pairs.styles]
             assert abs(samples.mean() - expected) < 5 * samples.std() / np.sqrt(draws) + 1e-6
-        # Weighted drawing leaves the loss as the only source of variance: the weight is the row's mean.
-        torch.testing.assert_close(pairs.weights, torch.full((draws,), float(weights[i, others].mean())))
+        # Weighted drawing leaves the loss as the only source of variance: the weight is constant.
+        mass = (1 - p) + p * weights[i, others].mean()
+        torch.testing.assert_close(pairs.weights, torch.full((draws,), float(mass)))
 
 
 @pytest.mark.parametrize("normalization", ["row", "global"])
@@ -53,7 +57,7 @@ def test_uniform_weights_equal_the_weight_matrix(normalization):
     GENERATOR.manual_seed(0)
     weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
     episodes = torch.arange(500) % N
-    pairs = make_sampler(normalization=normalization).draw(episodes, GENERATOR)
+    pairs = make_sampler(normalization=normalization, partner_sampling="uniform").draw(episodes, GENERATOR)
     np.testing.assert_allclose(pairs.weights, weights[episodes, pairs.styles], rtol=1e-5)
 
 

@@ -215,9 +215,9 @@ class WZBCConfig(ZBCConfig):
     beta: float = 10.0
     # Probability of relabelling a frame with another demonstration's style; 0 is ZBC.
     p: float = 0.8
-    # Draw partners uniformly and weight the loss ("uniform", the paper), or draw them by weight ("weighted",
-    # same expectation, less variance).
-    partner_sampling: str = "uniform"
+    # Draw pairs by their share in the expected loss ("weighted"), or partners uniformly with the loss weighted
+    # ("uniform", the paper: same expectation, but a share p of the batch teaches almost nothing).
+    partner_sampling: str = "weighted"
     # Divide distances by the farthest episode of each demonstration ("row", the paper) or of all ("global").
     similarity_normalization: str = "row"
     # Features, in their own units, over which demonstrations are compared; null takes all observations that

@@ -457,12 +457,12 @@ class WZBCPolicy(ZBCPolicy):
         return keys
 
     def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """(B,) loss of each frame: W(τ_i, τ_j) · |π(s, z_j) − a|², with j = i where it is not relabelled.
+        """(B,) weighted loss of each frame under its pair's style, whose mean has algorithm 1's expectation.
 
-        Figures to log: ``own_style_loss`` and ``relabelled_loss``, the mean error of the frames that keep
-        their style and of those that do not, before weighting; ``mean_weight`` of the latter; and
-        ``effective_demos`` per style. The first three divide by the expected number of such frames, not by
-        the batch's, so that a batch without any is no special case and their averages over time are unbiased.
+        Figures to log: ``own_style_loss``, the mean squared error of frames under their own style;
+        ``relabelled_loss``, the mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``, the mean
+        of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates, whichever way
+        pairs are drawn, and defined for every batch: read their averages over time.
         """
         if not self.training or self.sampler is None:
             return super().frame_losses(batch)
@@ -472,14 +472,14 @@ class WZBCPolicy(ZBCPolicy):
         pairs = self.sampler.draw(episodes, self.draws.next())
         style = self.styles.embedding(pairs.styles)
         style = torch.where(pairs.relabelled[:, None], style.detach(), style)
-        errors = self._action_errors(self.network(batch, style), batch)
+        losses = self._action_errors(self.network(batch, style), batch) * pairs.weights
 
         p = self.config.p
         figures = {"effective_demos": self.sampler.effective_demos}
         with torch.no_grad():
             if p < 1:
-                figures["own_style_loss"] = (errors * ~pairs.relabelled).mean().item() / (1 - p)
+                figures["own_style_loss"] = (losses * ~pairs.relabelled).mean().item() / (1 - p)
             if p > 0:
-                figures["relabelled_loss"] = (errors * pairs.relabelled).mean().item() / p
+                figures["relabelled_loss"] = (losses * pairs.relabelled).mean().item() / p
                 figures["mean_weight"] = (pairs.weights * pairs.relabelled).mean().item() / p
-        return errors * pairs.weights, figures
+        return losses, figures

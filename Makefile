@@ -1,0 +1,36 @@
+# Everything runs in .venv, which the first target that needs it sets up (several minutes, 5 GB: PyTorch).
+PYTHON ?= python3.12
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test slow lint bench
+
+help:  ## Show the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 10
+
+setup: $(READY)  ## Set up .venv with the package and its development tools
+
+$(READY): pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --upgrade pip
+	$(BIN)/python -m pip install -e '.[dev]'
+	touch $@
+
+demo: $(READY)  ## Train BC, ZBC and WZBC on two mazes and write outputs/demo/report.html (10 minutes)
+	HF_HUB_OFFLINE=1 $(BIN)/lerobot-swr-demo --output_dir=outputs/demo
+
+test: $(READY)  ## Run the fast tests (minutes)
+	HF_HUB_OFFLINE=1 $(BIN)/python -m pytest
+
+slow: $(READY)  ## Run the tests that train policies to their full quality (an hour)
+	HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -m slow
+
+lint: $(READY)  ## Check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+bench: $(READY)  ## Print the benchmarks
+	HF_HUB_OFFLINE=1 $(BIN)/python -m benchmarks

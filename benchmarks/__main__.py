@@ -1,0 +1,16 @@
+"""Runs every benchmark of this folder, each in its own process."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+
+def main() -> None:
+    """Run the benchmarks in the order of their names."""
+    for path in sorted(Path(__file__).parent.glob("bench_*.py")):
+        print(f"\n=== {path.stem} ===", flush=True)
+        subprocess.run([sys.executable, str(path)], check=True)
+
+
+if __name__ == "__main__":
+    main()
