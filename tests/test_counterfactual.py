@@ -63,7 +63,10 @@ def test_the_confusion_matrix_counts_and_distances_are_to_the_requested_demonstr
     assert result.distance == pytest.approx(np.sqrt(2) / 3)
     assert result.distance_to_others == pytest.approx(2 * np.sqrt(2) / 3)
     assert result.nearest_is_requested == pytest.approx(2 / 3)
-    assert "0.500" in format_counterfactual(result)
+    text = format_counterfactual(result)
+    assert "0.500" in text
+    assert "0 (right -> left)" in text
+    assert '--policy.style_filter="episode not in [0]"' in text
 
 
 def test_length_control_counts_both_kinds_of_episodes_alike():

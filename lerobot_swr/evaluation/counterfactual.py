@@ -196,4 +196,9 @@ def format_counterfactual(result: CounterfactualResult) -> str:
         f"{result.distance_to_others:.4f} (RMS over time, units of the state)",
         f"the requested demonstration is the nearest of all in {result.nearest_is_requested:.3f} of them",
     ]
+    strays = {e["style_episode"]: e for e in result.episodes if e["requested"] != e["shown"]}
+    if strays:
+        named = (f"{i} ({e['requested']} -> {e['shown'] or '(none)'})" for i, e in sorted(strays.items()))
+        lines.append(f"styles that led elsewhere: {', '.join(named)}; leave them out with")
+        lines.append(f'--policy.style_filter="episode not in {sorted(strays)}"')
     return "\n".join(lines)

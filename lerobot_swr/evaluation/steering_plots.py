@@ -59,7 +59,7 @@ def plot_length_control(path: Path, result: LengthControlResult, title: str) -> 
         place - 1, reference, 2, color="0.6", label=f"{result.n_demonstrations} demonstrations in the band"
     )
     axes.bar(place + 1, shown, 2, color="tab:blue", label=f"{result.n_episodes} rollouts")
-    axes.axvspan(result.band[0], result.band[1] + 1, color="tab:green", alpha=0.12, linewidth=0)
+    axes.axvspan(result.band[0], result.band[1] + 1, color="tab:green", alpha=0.12, linewidth=0, zorder=0)
     axes.set(xlabel="length in frames", ylabel="share of episodes")
     axes.set_xticks([*bins, bins[-1] + BIN_WIDTH], [*map(str, bins), str(bins[-1] + BIN_WIDTH)], rotation=90)
     axes.legend()
