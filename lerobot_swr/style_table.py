@@ -7,7 +7,6 @@ It is made from the training dataset when a policy is created and travels with t
 import json
 import logging
 import os
-import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -91,9 +90,9 @@ class StyleTable:
     def save(self, folder: Path) -> None:
         """Write the table into a checkpoint's folder, all or nothing."""
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=folder, prefix=TABLE_FILE, delete=False) as file:
-            json.dump(asdict(self), file)
-        os.replace(file.name, folder / TABLE_FILE)
+        unfinished = folder / f".{TABLE_FILE}.{os.getpid()}"
+        unfinished.write_text(json.dumps(asdict(self)))
+        os.replace(unfinished, folder / TABLE_FILE)
 
 
 def make_style_table(
