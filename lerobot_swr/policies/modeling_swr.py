@@ -34,6 +34,7 @@ logger = logging.getLogger(__name__)
 # `lerobot-swr-styles --add`.
 HELD_OUT_ENCODING_STEPS = 100
 HELD_OUT_FRAMES = 64  # per episode, evenly spread over it
+HELD_OUT_CHUNK = 32  # episodes encoded at once
 
 INSTALL_HINT = """
 ## Install
@@ -265,7 +266,7 @@ class ZBCPolicy(BCPolicy):
 
         The held-out loss of ``--dataset.eval_split`` thus tells how well *some* style of the policy explains
         an unseen demonstration. Every held-out episode is encoded once per evaluation, from the style of the
-        nearest trained one, when its first frame comes; ten values are fitted to all its frames.
+        nearest trained one; its z is fitted to frames all over it.
 
         Raises:
             RuntimeError: If the policy was created without a dataset.
@@ -274,6 +275,10 @@ class ZBCPolicy(BCPolicy):
         styles = self.styles.embedding(episodes).clone()
         missing = [i for i in episodes[~trained[episodes]].unique().tolist() if i not in self._held_out]
         if missing:
+            # Evaluation goes through the episodes in order: the next ones are encoded along, at little cost.
+            following = (~trained[: self.config.num_episodes]).nonzero().squeeze(1).tolist()
+            following = [i for i in following if i > missing[-1] and i not in self._held_out]
+            missing = missing + following[: max(0, HELD_OUT_CHUNK - len(missing))]
             candidates = trained[: self.config.num_episodes].nonzero().squeeze(1)
             to_trained = self.distances()[np.ix_(missing, candidates.cpu().numpy())]
             nearest = candidates[torch.from_numpy(to_trained.argmin(axis=1)).to(candidates.device)]
