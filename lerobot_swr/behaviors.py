@@ -6,6 +6,7 @@ this package carries its own rule; a user names another one as ``module:function
 
 import importlib
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,31 @@ no successful episode has.
 """
 
 
+DATASET_RULES = {
+    "maze2d_small": "lerobot_swr.envs.maze2d.behavior:small",
+    "maze2d_medium": "lerobot_swr.envs.maze2d.behavior:medium",
+    "maze2d_large": "lerobot_swr.envs.maze2d.behavior:large",
+}
+"""``robot_type`` of this package's own datasets to the rule that labels their episodes."""
+
+
+def dataset_behavior_rule(path: str | None, robot_type: str | None) -> BehaviorRule | None:
+    """The rule that labels a dataset's demonstrations.
+
+    Args:
+        path: ``module:function``; None takes the rule of this package's own datasets.
+        robot_type: Of the dataset's metadata.
+
+    Returns:
+        None if no path is given and the dataset is not this package's.
+
+    Raises:
+        ValueError: If the path does not lead to a function.
+    """
+    path = path or DATASET_RULES.get(robot_type or "")
+    return None if path is None else load_behavior_rule(path)
+
+
 def load_behavior_rule(path: str) -> BehaviorRule:
     """Import a behaviour rule given as ``module:function``.
 
@@ -27,17 +53,40 @@ def load_behavior_rule(path: str) -> BehaviorRule:
     Raises:
         ValueError: If the path has another form, or the module or the function does not exist.
     """
+    return load_function("behavior_rule", path)
+
+
+def load_function(key: str, path: str) -> Callable[..., Any]:
+    """Import a user's function given as ``module:function``.
+
+    Args:
+        key: The option that names it, for messages.
+        path: Dotted module and function name.
+
+    Raises:
+        ValueError: If the path has another form, or the module or the function does not exist.
+    """
     module_name, separator, function_name = path.partition(":")
     if not (module_name and separator and function_name):
-        raise ValueError(f"behavior_rule={path!r}: expected 'module:function', e.g. 'my_project.rules:side'")
+        raise ValueError(f"{key}={path!r}: expected 'module:function', e.g. 'my_project.rules:side'")
     try:
-        rule = getattr(importlib.import_module(module_name), function_name)
+        function = getattr(importlib.import_module(module_name), function_name)
     except ModuleNotFoundError as error:
         raise ValueError(
-            f"behavior_rule={path!r}: {error}; is the module on PYTHONPATH and spelled right?"
+            f"{key}={path!r}: {error}; is the module on PYTHONPATH and spelled right?"
         ) from error
     except AttributeError as error:
-        raise ValueError(f"behavior_rule={path!r}: {error}") from error
-    if not callable(rule):
-        raise ValueError(f"behavior_rule={path!r}: {function_name} is not callable")
-    return rule
+        raise ValueError(f"{key}={path!r}: {error}") from error
+    if not callable(function):
+        raise ValueError(f"{key}={path!r}: {function_name} is not callable")
+    return function
+
+
+def load_style_metrics(paths: str | None) -> dict[str, Callable[..., Any]]:
+    """Import user metrics given as ``module:function``, several separated by commas, by function name.
+
+    Raises:
+        ValueError: If a path does not lead to a function.
+    """
+    listed = [path.strip() for path in (paths or "").split(",") if path.strip()]
+    return {path.partition(":")[2]: load_function("style_metrics", path) for path in listed}

@@ -3,10 +3,16 @@
 from collections.abc import Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lerobot_swr.style_selection import StyleSelection
+from lerobot_swr.style_table import StyleTable
+
 StyleSampling = Literal["uniform", "stratified", "fixed"]
+
+BLENDED = -1  # stands in `StyleCookbook.active` for a style that is no single episode's
 
 
 class StyleCookbook(nn.Module):
@@ -14,8 +20,13 @@ class StyleCookbook(nn.Module):
 
     Attributes:
         embedding: `nn.Embedding` with one row per episode, (N, style_dim).
-        trained: (N,) uint8 buffer, 1 where the episode has been trained on; only those styles are ever drawn.
-        active: (B,) int64, the episodes whose styles the current rollout uses; None before its first action.
+        trained: (N,) uint8 buffer, 1 where the episode has been trained on (or encoded); only those styles
+            are ever drawn.
+        active: (B,) int64, the episodes whose styles the current rollout uses, `BLENDED` for a blend; None
+            before its first action.
+        table: What is known of each demonstration; None where the checkpoint has no table.
+        selection: Which styles may be drawn.
+        blend: (i, j, share) makes every rollout use (1 − share) z_i + share z_j; None draws styles.
 
     Args:
         num_episodes: N.
@@ -24,7 +35,7 @@ class StyleCookbook(nn.Module):
         sampling: ``uniform`` draws with replacement (eq. 2); ``stratified`` uses each allowed style once, in
             random order, before any is used again; ``fixed`` takes the allowed styles in their given order,
             over and over.
-        episodes: The styles that may be drawn, by episode; None allows all that were trained.
+        selection: Which styles may be drawn; by default all that were trained.
 
     Raises:
         ValueError: For an unknown way of sampling, or a selection that is empty or out of range.
@@ -36,18 +47,19 @@ class StyleCookbook(nn.Module):
         style_dim: int,
         init_scale: float,
         sampling: StyleSampling = "uniform",
-        episodes: Sequence[int] | None = None,
+        selection: StyleSelection | None = None,
     ):
         super().__init__()
         check_style_sampling(sampling)
-        check_style_episodes(episodes, num_episodes)
         self.embedding = nn.Embedding(num_episodes, style_dim)
         nn.init.normal_(self.embedding.weight, std=init_scale)
         self.trained: Tensor
         self.register_buffer("trained", torch.zeros(num_episodes, dtype=torch.uint8))
-        self.sampling, self.selected = sampling, episodes
+        self.sampling = sampling
+        self.table: StyleTable | None = None
         self.active: Tensor | None = None
-        self._queue: list[int] = []
+        self.blend: tuple[int, int, float] | None = None
+        self.restrict(selection or StyleSelection())
 
     def __len__(self) -> int:
         """Number of episodes, trained or not."""
@@ -59,54 +71,118 @@ class StyleCookbook(nn.Module):
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             torch.distributed.all_reduce(self.trained, torch.distributed.ReduceOp.MAX)
 
-    def allowed(self) -> Tensor:
-        """(M,) int64, the episodes whose styles may be drawn.
+    # --- Choosing styles ---
+
+    def filter(self, text: str) -> list[int]:
+        """The episodes that match a filter and have a style, e.g. ``"70 <= length <= 80"``.
 
         Raises:
-            ValueError: If nothing was trained, or a selected style was not.
+            ValueError: If there are none, the filter is none, or the checkpoint has no table.
         """
-        trained = self.trained.bool()
-        if not trained.any():
-            raise ValueError("no style has been trained yet: train the policy, or load a trained checkpoint")
-        if self.selected is None:
-            return trained.nonzero().squeeze(1)
-        untrained = [episode for episode in self.selected if not trained[episode]]
-        if untrained:
-            raise ValueError(
-                f"style_episodes={list(self.selected)}: episodes {untrained} were not in the training data "
-                f"of this checkpoint, so they have no style; {int(trained.sum())} of {len(self)} episodes do"
-            )
-        return torch.tensor(list(self.selected), device=self.trained.device)
+        return StyleSelection(filter=text).resolve(self._is_trained(), self.table)
 
-    def draw(self, batch_size: int) -> Tensor:
-        """Draw the styles of `batch_size` episodes from torch's global generator: (B,) int64, by episode."""
-        allowed = self.allowed()
+    def select(self, episodes: Sequence[int] | None) -> None:
+        """From the next rollout on draw these episodes' styles only; None allows all again.
+
+        Raises:
+            ValueError: If the selection is empty, or an episode does not exist.
+        """
+        self.restrict(StyleSelection(episodes=episodes))
+
+    def restrict(self, selection: StyleSelection) -> None:
+        """From the next rollout on draw only the styles of a selection.
+
+        Raises:
+            ValueError: If an episode of the selection does not exist.
+        """
+        selection.check_episodes(len(self))
+        self.selection, self.blend = selection, None
+        self._queues: dict[str | None, list[int]] = {}
+
+    def interpolate(self, i: int, j: int, share: float) -> None:
+        """From the next rollout on use the blend (1 − share) z_i + share z_j, until `select` or `restrict`.
+
+        Raises:
+            ValueError: If an episode has no style, or the share is outside 0 to 1.
+        """
+        StyleSelection(episodes=(i, j)).check_episodes(len(self))
+        StyleSelection(episodes=(i, j)).resolve(self._is_trained(), None)
+        if not 0 <= share <= 1:
+            raise ValueError(f"style_interpolate=[{i}, {j}, {share}]: the share must lie in 0 to 1")
+        self.blend = (i, j, share)
+
+    def allowed(self, name: str | None = None) -> Tensor:
+        """(M,) int64, the episodes whose styles may be drawn, also by the table's filter called `name`.
+
+        Raises:
+            ValueError: If there are none, or a selected style was not trained.
+        """
+        episodes = self.selection.resolve(self._is_trained(), self.table, name)
+        return torch.tensor(episodes, device=self.trained.device)
+
+    def _is_trained(self) -> np.ndarray:
+        return self.trained.bool().cpu().numpy()
+
+    # --- Drawing styles ---
+
+    def draw(self, batch_size: int, tasks: Sequence[str] = ()) -> Tensor:
+        """Draw the styles of `batch_size` episodes from torch's global generator: (B,) int64, by episode.
+
+        Args:
+            batch_size: B.
+            tasks: One task string per episode; one that is the name of a filter of the table restricts the
+                draw to it. Empty for none.
+        """
+        filters = {} if self.table is None else self.table.filters
+        names = [task if task in filters else None for task in tasks] or [None] * batch_size
+        drawn = torch.empty(batch_size, dtype=torch.int64, device=self.trained.device)
+        for name in dict.fromkeys(names):
+            places = [place for place, other in enumerate(names) if other == name]
+            drawn[places] = self._draw(len(places), name)
+        return drawn
+
+    def _draw(self, count: int, name: str | None) -> Tensor:
+        allowed = self.allowed(name)
         if self.sampling == "uniform":
-            return allowed[torch.randint(len(allowed), (batch_size,), device=allowed.device)]
-        while len(self._queue) < batch_size:
+            return allowed[torch.randint(len(allowed), (count,), device=allowed.device)]
+        queue = self._queues.setdefault(name, [])
+        while len(queue) < count:
             order = torch.arange(len(allowed)) if self.sampling == "fixed" else torch.randperm(len(allowed))
-            self._queue += allowed.cpu()[order].tolist()
-        drawn, self._queue = self._queue[:batch_size], self._queue[batch_size:]
-        return torch.tensor(drawn, device=allowed.device)
+            queue += allowed.cpu()[order].tolist()
+        self._queues[name] = queue[count:]
+        return torch.tensor(queue[:count], device=allowed.device)
+
+    # --- Rollouts ---
 
     def end_rollout(self) -> None:
         """Forget the active styles; the next action draws new ones."""
         self.active = None
 
-    def active_styles(self, batch_size: int) -> Tensor:
+    def active_styles(self, batch_size: int, tasks: Sequence[str] = ()) -> Tensor:
         """(B, style_dim) styles of the rollout under way, drawn at its first action and kept to its end.
+
+        Args:
+            batch_size: B.
+            tasks: As in `draw`.
 
         Raises:
             ValueError: If the batch size changes within a rollout.
         """
         if self.active is None:
-            self.active = self.draw(batch_size)
+            if self.blend is not None:
+                self.active = torch.full((batch_size,), BLENDED)
+            else:
+                self.active = self.draw(batch_size, tasks)
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
                 "call policy.reset() before a rollout with another number of environments"
             )
-        return self.embedding(self.active)
+        if self.blend is None:
+            return self.embedding(self.active)
+        i, j, share = self.blend
+        start, end = self.embedding.weight[[i, j]]
+        return torch.lerp(start, end, share).expand(batch_size, -1)
 
 
 def check_style_sampling(sampling: str) -> None:
@@ -117,21 +193,3 @@ def check_style_sampling(sampling: str) -> None:
     """
     if sampling not in ("uniform", "stratified", "fixed"):
         raise ValueError(f"style_sampling={sampling!r}: expected 'uniform', 'stratified' or 'fixed'")
-
-
-def check_style_episodes(episodes: Sequence[int] | None, num_episodes: int) -> None:
-    """Refuse a selection of styles that is empty or names episodes that do not exist.
-
-    Raises:
-        ValueError: Naming the selection.
-    """
-    if episodes is None:
-        return
-    if len(episodes) == 0:
-        raise ValueError("style_episodes=[]: the selection of styles is empty; leave it out to allow all")
-    unknown = [episode for episode in episodes if not 0 <= episode < num_episodes]
-    if unknown:
-        raise ValueError(
-            f"style_episodes={list(episodes)}: episodes {unknown} do not exist; "
-            f"this cookbook has episodes 0 to {num_episodes - 1}"
-        )

@@ -20,12 +20,14 @@ class Trajectories:
         columns: Feature name to (sum of lengths, d) float32, episodes one after the other.
         fps: Control rate of the recording, in Hz.
         name: How messages call the dataset.
+        tasks: N task strings, or empty.
     """
 
     lengths: np.ndarray
     columns: dict[str, np.ndarray]
     fps: int
     name: str
+    tasks: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -50,6 +52,13 @@ class Trajectories:
         joined = np.concatenate([self.columns[key] for key in keys], axis=1)
         return np.split(joined, self.starts[1:])
 
+    def subset(self, episodes: Sequence[int]) -> "Trajectories":
+        """Some of the episodes, in the given order."""
+        parts = [self.episode(i) for i in episodes]
+        columns = {key: np.concatenate([part[key] for part in parts]) for key in self.columns}
+        tasks = tuple(self.tasks[i] for i in episodes) if self.tasks else ()
+        return Trajectories(self.lengths[list(episodes)], columns, self.fps, self.name, tasks)
+
     def fingerprint(self, keys: Sequence[str]) -> str:
         """Hash of the content of the features `keys` and of the episodes' lengths, in hexadecimal."""
         digest = hashlib.sha256(np.ascontiguousarray(self.lengths).tobytes())
@@ -64,7 +73,7 @@ def load_trajectories(meta: LeRobotDatasetMetadata, keys: Sequence[str]) -> Traj
 
     Args:
         meta: Metadata of a dataset whose data files are on this machine.
-        keys: Names of numeric features, e.g. ``["observation.state", "action"]``.
+        keys: Names of numeric or boolean features, e.g. ``["observation.state", "action"]``.
 
     Raises:
         FileNotFoundError: If the dataset's data files are not on this machine.
@@ -92,18 +101,20 @@ def load_trajectories(meta: LeRobotDatasetMetadata, keys: Sequence[str]) -> Traj
             f"dataset {name}: meta/info.json promises {meta.total_episodes} episodes in order, the data "
             f"files hold {len(np.unique(episode_index))}; is the dataset complete (was it finalized)?"
         )
-    trajectories = Trajectories(lengths, columns, meta.fps, name)
+    tasks = tuple("; ".join(names) for names in meta.episodes["tasks"])
+    trajectories = Trajectories(lengths, columns, meta.fps, name, tasks)
     _check_finite(trajectories, episode_index)
     return trajectories
 
 
 def _as_array(column: pa.ChunkedArray, key: str, name: str) -> np.ndarray:
-    """A column of numbers or of lists of equal length as (frames, d) float32."""
+    """A column of numbers, of truth values or of lists of equal length of them as (frames, d) float32."""
     array = column.combine_chunks()
     n_frames = len(array)
     while pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
         array = array.flatten()
-    if not (pa.types.is_floating(array.type) or pa.types.is_integer(array.type)):
+    numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
+    if not any(is_kind(array.type) for is_kind in numeric):
         raise ValueError(f"dataset {name}: feature {key!r} is not numeric ({array.type})")
     return array.to_numpy(zero_copy_only=False).reshape(n_frames, -1).astype(np.float32)
 

@@ -103,3 +103,9 @@ def train_flags(policy_type: str, root: Path, output_dir: Path, steps: int, *mor
         f"--output_dir={output_dir}",
         *more,
     ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def subnormal_numbers() -> None:
+    """Undo what policies of earlier modules set for the whole process (``flush_denormal``)."""
+    torch.set_flush_denormal(False)

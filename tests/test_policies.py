@@ -205,21 +205,6 @@ def test_only_trained_episodes_are_drawn_after_loading(make_tiny_policy, small_m
     assert set(loaded.styles.active.tolist()) == {0, 1, 2, 3}
 
 
-def test_held_out_episodes_are_scored_with_their_nearest_trained_style(make_tiny_policy):
-    """In evaluation mode an untrained episode borrows a style and is not marked as trained."""
-    policy = make_tiny_policy("zbc", balance_episodes=False)
-    policy.train()
-    seen = {**make_batch(), "episode_index": torch.arange(32) % 4}
-    policy.forward(seen)
-    policy.eval()
-    distances = policy.distances()
-    nearest = int(distances[5, :4].argmin())
-    held_out = {**make_batch(4), "episode_index": torch.full((4,), 5)}
-    borrowed = {**held_out, "episode_index": torch.full((4,), nearest)}
-    assert policy.forward(held_out)[0].item() == policy.forward(borrowed)[0].item()
-    assert policy.styles.trained.tolist() == [1, 1, 1, 1, 0, 0]
-
-
 def test_fine_tuning_on_other_data_keeps_the_network_and_starts_new_styles(
     make_tiny_policy, small_maze_meta, tmp_path, caplog
 ):

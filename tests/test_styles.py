@@ -5,6 +5,7 @@ from collections import Counter
 import pytest
 import torch
 
+from lerobot_swr.style_selection import StyleSelection
 from lerobot_swr.styles import StyleCookbook
 
 
@@ -33,7 +34,7 @@ def test_stratified_drawing_uses_each_style_once_before_any_again_across_rollout
 
 def test_fixed_drawing_keeps_the_given_order():
     """Styles in their order, over and over."""
-    cookbook = make_cookbook(sampling="fixed", episodes=[4, 1])
+    cookbook = make_cookbook(sampling="fixed", selection=StyleSelection(episodes=[4, 1]))
     assert cookbook.draw(3).tolist() == [4, 1, 4]
     assert cookbook.draw(2).tolist() == [1, 4]
 
@@ -62,19 +63,19 @@ def test_another_batch_size_within_a_rollout_is_an_error():
     ("options", "message"),
     [
         ({"sampling": "random"}, "style_sampling='random'"),
-        ({"episodes": []}, r"style_episodes=\[\].*empty"),
-        ({"episodes": [2, 6]}, r"episodes \[6\] do not exist.*0 to 5"),
+        ({"selection": lambda: StyleSelection(episodes=[])}, r"style_episodes=\[\].*empty"),
+        ({"selection": lambda: StyleSelection(episodes=[2, 6])}, r"episodes \[6\] do not exist.*0 to 5"),
     ],
 )
 def test_bad_options_are_named(options, message):
     """Unknown options and empty or impossible selections are refused when the cookbook is made."""
     with pytest.raises(ValueError, match=message):
-        make_cookbook(**options)
+        make_cookbook(**{key: make() if callable(make) else make for key, make in options.items()})
 
 
 def test_untrained_styles_cannot_be_selected():
     """A selected episode that was not trained on has no style."""
     with pytest.raises(ValueError, match=r"episodes \[3\] were not in the training data"):
-        make_cookbook(trained=[0, 1], episodes=[1, 3]).draw(1)
+        make_cookbook(trained=[0, 1], selection=StyleSelection(episodes=[1, 3])).draw(1)
     with pytest.raises(ValueError, match="no style has been trained"):
         make_cookbook(trained=[]).draw(1)

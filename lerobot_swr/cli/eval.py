@@ -26,11 +26,20 @@ from lerobot.utils.utils import init_logging
 from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, write_json
-from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, path_of, write_json
+from lerobot_swr.evaluation.blending import format_blends, run_blends
+from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.counterfactual import format_counterfactual, run_counterfactual
+from lerobot_swr.evaluation.length_control import (
+    evaluate_length_control,
+    format_length_control,
+    frames_after_end,
+)
 from lerobot_swr.evaluation.offline import KINDS, format_offline, frame_errors, summarize
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
+from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactual, plot_length_control
 from lerobot_swr.styles import check_style_sampling
+from lerobot_swr.trajectories import Trajectories
 
 
 @dataclass
@@ -50,6 +59,13 @@ class EvalCommand:
     # How styles are drawn: uniform (the paper), stratified (each style once before any again) or fixed; null
     # keeps the checkpoint's setting.
     style_sampling: str | None = None
+    # Request every demonstrated behaviour from this many starts, the same for all, instead of n_episodes
+    # rollouts: confusion matrix, control accuracy, distance to the requested demonstrations. 0 does not.
+    counterfactual: int = 0
+    # Blend this many pairs of styles of the same behaviour, and of different ones, instead. 0 does not.
+    blend: int = 0
+    # [shortest, longest] in frames: compare the rollouts' lengths with the demonstrations' in this band.
+    length_band: list[int] | None = None
     # Labels episodes: module:function; null takes the environment's own rule.
     behavior_rule: str | None = None
     # Seeds the drawing of styles and the environments.
@@ -80,6 +96,11 @@ class EvalCommand:
             check_style_sampling(self.style_sampling)
             if hasattr(self.policy, "style_sampling"):
                 self.policy.style_sampling = self.style_sampling
+        if self.length_band is not None and len(self.length_band) != 2:
+            raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
+        for key in ("counterfactual", "blend"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"{key}={getattr(self, key)}: expected a number >= 0")
         for key in ("n_episodes", "batch_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
@@ -109,6 +130,9 @@ def evaluate(cfg: EvalCommand) -> None:
         print(f"{title}\n{format_offline(offline)}\nwritten to {cfg.output_dir}")
         return
 
+    if cfg.counterfactual or cfg.blend:
+        _steer(cfg, checkpoint, trajectories, title)
+        return
     comparison = compare(
         checkpoint,
         trajectories,
@@ -130,7 +154,43 @@ def evaluate(cfg: EvalCommand) -> None:
         cfg.env,
         f"{title}: L1 {result.l1:.3f} (floor {result.l1_floor:.3f}), success {result.success_rate:.2f}",
     )
-    print(f"{title}\n{format_result(result)}\nwritten to {cfg.output_dir}")
+    print(f"{title}\n{format_result(result)}")
+    if cfg.length_band is not None:
+        control = evaluate_length_control(
+            [episode["length"] for episode in result.episodes],
+            trajectories.lengths.tolist(),
+            (cfg.length_band[0], cfg.length_band[1]),
+            frames_after_end(trajectories, cfg.env),
+        )
+        write_json(cfg.output_dir / "length_control.json", control, _provenance(cfg))
+        plot_length_control(cfg.output_dir / "length_control.png", control, f"{title}: L1 {control.l1:.3f}")
+        print(format_length_control(control))
+    print(f"written to {cfg.output_dir}")
+
+
+def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories, title: str) -> None:
+    """The checks that request styles."""
+    assert cfg.env is not None
+    assert cfg.output_dir is not None
+    rule = _rule(cfg)
+    if cfg.counterfactual:
+        check, _ = run_counterfactual(
+            checkpoint, trajectories, cfg.env, rule, cfg.counterfactual, cfg.batch_size, cfg.seed
+        )
+        write_json(cfg.output_dir / "counterfactual.json", check, _provenance(cfg))
+        heading = f"{title}: control accuracy {check.control_accuracy:.3f}"
+        plot_counterfactual(cfg.output_dir / "counterfactual.png", check, heading)
+        print(f"{title}\n{format_counterfactual(check)}")
+    if cfg.blend:
+        demonstrated = [rule(episode) for episode in trajectories.episodes()]
+        blends, rollouts = run_blends(
+            checkpoint, cfg.env, rule, demonstrated, cfg.blend, cfg.batch_size, cfg.seed
+        )
+        write_json(cfg.output_dir / "blend.json", blends, _provenance(cfg))
+        paths = [path_of(cfg.env, rollout.observations) for rollout in rollouts]
+        plot_blends(cfg.output_dir / "blend.png", blends, paths, cfg.env, f"{title}: blends of two styles")
+        print(f"{title}\n{format_blends(blends)}")
+    print(f"written to {cfg.output_dir}")
 
 
 def _rule(cfg: EvalCommand) -> BehaviorRule:

@@ -141,7 +141,7 @@ def _recipe(name: str, task: str, counts: dict[str, int], speed: SpeedRule) -> D
         name=name,
         instruction=INSTRUCTION,
         fps=FPS,
-        robot_type="maze2d",
+        robot_type=f"maze2d_{task}",
         features={
             "observation.state": ("x", "y"),
             "observation.environment_state": ("goal_x", "goal_y"),

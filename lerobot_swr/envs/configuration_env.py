@@ -36,6 +36,13 @@ class TaskEnvConfig(EnvConfig):
         """(T, 2) path of an episode, as pictures draw it: by default the first two state dimensions."""
         return observations["observation.state"][:, :2]
 
+    def steps_to_end(self, observations: Mapping[str, np.ndarray]) -> int:
+        """Actions after which the environment would have ended a demonstration; by default all of them.
+
+        Demonstrations may go on recording where an environment ends the episode.
+        """
+        return len(observations["observation.state"])
+
     def draw_scene(self, axes: Axes) -> None:
         """Draw what does not move (walls, obstacles) behind the paths; by default nothing."""
 

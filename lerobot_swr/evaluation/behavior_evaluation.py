@@ -77,7 +77,8 @@ def evaluate_behaviors(
 
     Args:
         rollouts: Episodes of the policy.
-        demonstrated: The label of every episode of the dataset.
+        demonstrated: The label of every episode of the dataset; rollouts with a style added for an
+            episode of another dataset are left out of the style fidelity.
         style_sampling: How styles were drawn; None for a policy without styles.
         reference_episodes: The episodes that make up the reference histogram; None takes all.
     """
@@ -87,7 +88,8 @@ def evaluate_behaviors(
     reference = [demonstrated[i] for i in chosen]
     reference_histogram = histogram(reference)
     floor = l1_floor(reference, len(rollouts), stratified=style_sampling in ("stratified", "fixed"))
-    requested = [demonstrated[r.style_episode] for r in rollouts if r.style_episode is not None]
+    styled = [r for r in rollouts if r.style_episode is not None and r.style_episode < len(demonstrated)]
+    requested = [demonstrated[r.style_episode] for r in styled if r.style_episode is not None]
     return BehaviorResult(
         style_sampling=style_sampling,
         n_episodes=len(rollouts),
@@ -99,7 +101,7 @@ def evaluate_behaviors(
         l1_floor_band=floor.band,
         coverage=coverage(labels, reference_histogram),
         entropy=success_entropy(labels, successes, len(reference_histogram)),
-        style_fidelity=style_fidelity(labels, requested) if requested else None,
+        style_fidelity=style_fidelity([r.behavior for r in styled], requested) if styled else None,
         histogram=histogram(labels),
         reference_histogram=reference_histogram,
         episodes=[
@@ -158,12 +160,13 @@ def compare(
     chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
     return Comparison(
         evaluate_behaviors(rollouts, demonstrated, sampling, reference_episodes),
-        [(_path(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
-        [(_path(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
+        [(path_of(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
+        [(path_of(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
     )
 
 
-def _path(env_cfg: EnvConfig, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+def path_of(env_cfg: EnvConfig, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+    """(T, 2) path of an episode, as pictures draw it."""
     if isinstance(env_cfg, TaskEnvConfig):
         return env_cfg.plot_path(observations)
     return observations["observation.state"][:, :2]

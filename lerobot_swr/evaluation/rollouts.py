@@ -1,5 +1,6 @@
 """Rollouts of any LeRobot policy, with the states that behaviour rules need."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.styles import BLENDED
 
 
 @dataclass(frozen=True)
@@ -23,7 +25,7 @@ class Rollout:
         behavior: Label that the rule gave.
         success: Whether the environment called it a success.
         length: T, number of actions.
-        style_episode: The demonstration whose style was used; None for a policy without styles.
+        style_episode: The demonstration whose style was used; None for a policy without styles or a blend.
     """
 
     observations: dict[str, np.ndarray]
@@ -100,6 +102,7 @@ def run_rollouts(
     n_episodes: int,
     batch_size: int,
     seed: int,
+    env_seeds: Sequence[int] | None = None,
 ) -> list[Rollout]:
     """Roll a policy out and label its behaviours.
 
@@ -110,7 +113,9 @@ def run_rollouts(
         n_episodes: Number of episodes.
         batch_size: Largest number of environments that run at once.
         seed: Seeds torch once and environment k with ``seed + k``.
+        env_seeds: Seeds of the environments, one per episode, instead.
     """
+    env_seeds = range(seed, seed + n_episodes) if env_seeds is None else env_seeds
     set_seed(seed)
     env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg, checkpoint.policy.config)
     rollouts: list[Rollout] = []
@@ -125,7 +130,7 @@ def run_rollouts(
                 env_postprocessor,
                 checkpoint.preprocessor,
                 checkpoint.postprocessor,
-                seeds=[seed + len(rollouts) + i for i in range(size)],
+                seeds=list(env_seeds[len(rollouts) : len(rollouts) + size]),
             )
             episodes = env.episodes()
         finally:
@@ -135,5 +140,6 @@ def run_rollouts(
             length = int(outcome["done"][i].int().argmax()) + 1
             states = {key: value[: length + 1] for key, value in observations.items()}
             success = bool(outcome["success"][i, :length].any())
-            rollouts.append(Rollout(states, rule(states), success, length, styles[i]))
+            style = None if styles[i] in (None, BLENDED) else styles[i]
+            rollouts.append(Rollout(states, rule(states), success, length, style))
     return rollouts

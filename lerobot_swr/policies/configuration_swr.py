@@ -15,6 +15,7 @@ from lerobot.utils.constants import OBS_STATE
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import check_beta, check_normalization
+from lerobot_swr.style_selection import StyleSelection
 from lerobot_swr.styles import check_style_sampling
 
 
@@ -148,6 +149,26 @@ class ZBCConfig(BCConfig):
     style_sampling: str = "uniform"
     # Only the styles of these episodes of the training dataset; null allows all that were trained.
     style_episodes: list[int] | None = None
+    # Only the styles of demonstrations that match a filter, e.g. "70 <= length <= 80 and behavior == '6410'";
+    # lerobot-swr-styles CHECKPOINT lists the names. This and the conditions before and after must all hold.
+    style_filter: str | None = None
+    # Only the styles of this episode and of those nearest to it by dissimilarity.
+    style_like: int | None = None
+    # How many of the nearest others style_like allows.
+    style_neighbours: int = 5
+    # [i, j, share]: every rollout uses the blend (1 - share) z_i + share z_j of two episodes' styles.
+    style_interpolate: list[float] | None = None
+
+    # --- The demonstrations' table, made when the policy is created with its dataset ---
+    # Labels demonstrations in the column "behavior": module:function. null takes the rule of this package's
+    # own datasets; other datasets then have no such column.
+    behavior_rule: str | None = None
+    # Further columns: module:function, or several separated by commas; a column has its function's name.
+    style_metrics: str | None = None
+
+    # --- Set by lerobot-swr-styles --add; not meant to be given ---
+    # Number of styles that were encoded for episodes of other datasets, after those of the training dataset.
+    num_added_styles: int = 0
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -161,6 +182,23 @@ class ZBCConfig(BCConfig):
         if not self.style_init_scale >= 0:
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
         check_style_sampling(self.style_sampling)
+        selection = self.style_selection
+        if self.style_interpolate is not None:
+            if len(self.style_interpolate) != 3 or any(i != int(i) for i in self.style_interpolate[:2]):
+                raise ValueError(
+                    f"style_interpolate={self.style_interpolate}: expected [i, j, share], two episodes and a "
+                    "share from 0 to 1"
+                )
+            if selection != StyleSelection(neighbours=self.style_neighbours):
+                raise ValueError(
+                    f"style_interpolate={self.style_interpolate} fixes the style: leave out style_episodes, "
+                    "style_filter and style_like"
+                )
+
+    @property
+    def style_selection(self) -> StyleSelection:
+        """Which styles may be drawn."""
+        return StyleSelection(self.style_episodes, self.style_filter, self.style_like, self.style_neighbours)
 
 
 @PreTrainedConfig.register_subclass("wzbc")

@@ -1,6 +1,7 @@
 """The policies ``bc``, ``zbc`` and ``wzbc``."""
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self, cast
 
@@ -15,14 +16,25 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.network import ActionNetwork
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import cached_distances
+from lerobot_swr.style_encoding import Frames, encode_styles
+from lerobot_swr.style_selection import StyleSelection
+from lerobot_swr.style_table import OUTCOMES, StyleTable, load_style_table, make_style_table
 from lerobot_swr.styles import StyleCookbook
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 logger = logging.getLogger(__name__)
+
+# The held-out loss encodes episodes in the middle of training, so it spends less than
+# `lerobot-swr-styles --add`.
+HELD_OUT_ENCODING_STEPS = 100
+HELD_OUT_FRAMES = 64  # per episode, evenly spread over it
+HELD_OUT_CHUNK = 32  # episodes encoded at once
 
 INSTALL_HINT = """
 ## Install
@@ -56,7 +68,7 @@ class BCPolicy(PreTrainedPolicy):
         if config.flush_denormal:
             torch.set_flush_denormal(True)
         self._trajectories: Trajectories | None = None
-        self._dataset_root: Path | None = None
+        self._dataset_meta: LeRobotDatasetMetadata | None = None
         self._new_dataset = False
         if dataset_meta is not None:
             self._adopt_dataset(dataset_meta)
@@ -90,8 +102,9 @@ class BCPolicy(PreTrainedPolicy):
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
         """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
         config = self.config
-        self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION])
-        self._dataset_root = Path(meta.root)
+        outcomes = [key for key in OUTCOMES if key in meta.features]
+        self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION, *outcomes])
+        self._dataset_meta = meta
         fingerprint = self._trajectories.fingerprint([OBS_STATE])
         known = config.dataset_fingerprint
         self._new_dataset = known is not None and known != fingerprint
@@ -220,12 +233,15 @@ class ZBCPolicy(BCPolicy):
                 "(dataset_meta) or from a checkpoint (num_episodes)"
             )
         self.styles = StyleCookbook(
-            config.num_episodes,
+            config.num_episodes + config.num_added_styles,
             config.style_dim,
             config.style_init_scale,
             config.style_sampling,  # type: ignore[arg-type]
-            config.style_episodes,
+            config.style_selection,
         )
+        self._held_out: dict[int, Tensor] = {}
+        if dataset_meta is not None:
+            self.styles.table = self._make_table(dataset_meta)
 
     @property
     def _style_dim(self) -> int:
@@ -234,42 +250,87 @@ class ZBCPolicy(BCPolicy):
     def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """(B,) squared error of each frame under its own episode's style.
 
-        In evaluation mode an episode that was not trained on has no style of its own: the nearest trained
-        episode's style stands in.
+        In evaluation mode an episode that was not trained on has no style: the one that `held_out_styles`
+        encodes takes its place.
         """
         episodes = batch["episode_index"]
         if self.training:
             self.styles.mark_trained(episodes)
+            style = self.styles.embedding(episodes)
         else:
-            episodes = self.stand_ins()[episodes]
-        predicted = self.network(batch, self.styles.embedding(episodes))
-        return self._action_errors(predicted, batch), {}
+            style = self.held_out_styles(episodes)
+        return self._action_errors(self.network(batch, style), batch), {}
 
-    def stand_ins(self) -> Tensor:
-        """(N,) int64: every trained episode itself, for every other the nearest trained one.
+    def held_out_styles(self, episodes: Tensor) -> Tensor:
+        """(B, style_dim) styles of the (B,) `episodes`, encoded where they were not trained.
+
+        The held-out loss of ``--dataset.eval_split`` thus tells how well *some* style of the policy explains
+        an unseen demonstration. Every held-out episode is encoded once per evaluation, from the style of the
+        nearest trained one; its z is fitted to frames all over it.
 
         Raises:
             RuntimeError: If the policy was created without a dataset.
         """
-        is_trained = self.styles.trained.bool()
-        own = torch.arange(len(self.styles), device=is_trained.device)
-        if is_trained.all():
-            return own
-        trained = is_trained.nonzero().squeeze(1)
-        nearest = self.distances()[:, trained.cpu().numpy()].argmin(axis=1)
-        return torch.where(is_trained, own, trained[torch.from_numpy(nearest).to(own.device)])
+        trained = self.styles.trained.bool()
+        styles = self.styles.embedding(episodes).clone()
+        missing = [i for i in episodes[~trained[episodes]].unique().tolist() if i not in self._held_out]
+        if missing:
+            # Evaluation goes through the episodes in order: the next ones are encoded along, at little cost.
+            following = (~trained[: self.config.num_episodes]).nonzero().squeeze(1).tolist()
+            following = [i for i in following if i > missing[-1] and i not in self._held_out]
+            missing = missing + following[: max(0, HELD_OUT_CHUNK - len(missing))]
+            candidates = trained[: self.config.num_episodes].nonzero().squeeze(1)
+            to_trained = self.distances()[np.ix_(missing, candidates.cpu().numpy())]
+            nearest = candidates[torch.from_numpy(to_trained.argmin(axis=1)).to(candidates.device)]
+            starts = self.styles.embedding(nearest).detach()[:, None]
+            frames = [self._normalized_frames(i) for i in missing]
+            encoded, _ = encode_styles(self.network, frames, starts, HELD_OUT_ENCODING_STEPS)
+            self._held_out.update(zip(missing, encoded, strict=True))
+        for place, episode in enumerate(episodes.tolist()):
+            if episode in self._held_out:
+                styles[place] = self._held_out[episode]
+        return styles
+
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation; training again makes encoded styles out of date."""
+        if mode:
+            self._held_out = {}
+        return super().train(mode)
+
+    def _normalized_frames(self, episode: int) -> Frames:
+        """At most `HELD_OUT_FRAMES` frames of an episode, as batches bring them."""
+        assert self._trajectories is not None
+        assert self._dataset_meta is not None
+        preprocessor, _ = make_bc_pre_post_processors(self.config, self._dataset_meta.stats)
+        count = min(HELD_OUT_FRAMES, int(self._trajectories.lengths[episode]))
+        chosen = np.linspace(0, self._trajectories.lengths[episode] - 1, count).round().astype(int)
+        columns = self._trajectories.episode(episode)
+        keys = [*self.config.observation_keys, ACTION]
+        frames = preprocessor({key: torch.from_numpy(columns[key][chosen]) for key in keys})
+        return {key: frames[key] for key in keys}
 
     def distances(self) -> np.ndarray:
-        """(N, N) distances of the training dataset's episodes.
+        """(N, N) distances of the training dataset's episodes over the features that ν compares.
 
         Raises:
             RuntimeError: If the policy was created without a dataset.
+            ValueError: If a feature to compare is unknown.
         """
-        if self._trajectories is None or self._dataset_root is None:
+        if self._trajectories is None or self._dataset_meta is None:
             raise RuntimeError(
                 "distances between episodes need the dataset: create the policy with dataset_meta"
             )
-        return cached_distances(self._trajectories, self.config.observation_keys, self._dataset_root)
+        return cached_distances(self._trajectories, self.compared_keys(), Path(self._dataset_meta.root))
+
+    def compared_keys(self) -> Sequence[str]:
+        """The features over which ν compares demonstrations."""
+        return self.config.observation_keys
+
+    def _make_table(self, meta: LeRobotDatasetMetadata) -> StyleTable:
+        assert self._trajectories is not None
+        rule = dataset_behavior_rule(self.config.behavior_rule, meta.robot_type)
+        metrics = load_style_metrics(self.config.style_metrics)
+        return make_style_table(self._trajectories, self.distances(), rule, metrics)
 
     def reset(self) -> None:
         """Start a rollout: the next action draws new styles, one per environment."""
@@ -278,7 +339,63 @@ class ZBCPolicy(BCPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """(B, A) normalised actions for normalised observations (B, d), one style per environment."""
-        return self.network(batch, self.styles.active_styles(len(batch[OBS_STATE])))
+        tasks = cast(str | list[str], batch.get("task", []))
+        n_envs = len(batch[OBS_STATE])
+        style = self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
+        return self.network(batch, style)
+
+    # --- Checkpoints ---
+
+    def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
+        super()._adopt_dataset(meta)
+        if self._new_dataset:
+            self.config.num_added_styles = 0
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Load a checkpoint and its table of demonstrations; selections of styles are checked at once.
+
+        Raises:
+            ValueError: If the checkpoint is damaged, or the selection of styles is empty.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        known = ("revision", "token", "cache_dir", "local_files_only", "force_download")
+        options = {key: kwargs[key] for key in known if key in kwargs}
+        policy._adopt_table(load_style_table(pretrained_name_or_path, **options))
+        return policy
+
+    def _adopt_table(self, stored: StyleTable | None) -> None:
+        """Take the checkpoint's table, unless it describes another dataset than this policy's."""
+        styles = self.styles
+        if self._new_dataset:
+            if stored is not None and stored.filters:
+                logger.warning(
+                    "Named filters of the old dataset's styles are dropped: %s", ", ".join(stored.filters)
+                )
+        elif stored is not None:
+            if len(stored) != len(styles):
+                raise ValueError(
+                    f"styles.json has {len(stored)} rows, the checkpoint {len(styles)} styles; copy the "
+                    "checkpoint again"
+                )
+            styles.table = stored
+        elif styles.table is None:
+            logger.warning(
+                "This checkpoint has no table of its demonstrations (an earlier version made it): filters "
+                "are not available. Make it with lerobot-swr-styles CHECKPOINT --dataset.root=DATASET"
+            )
+        if self._dataset_meta is not None:
+            return  # in training; styles to draw need not exist yet
+        if self.config.style_interpolate is not None:
+            i, j, share = self.config.style_interpolate
+            styles.interpolate(int(i), int(j), share)
+        elif self.config.style_selection != StyleSelection(neighbours=self.config.style_neighbours):
+            styles.allowed()
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        super()._save_pretrained(save_directory, state_dict)
+        if self.styles.table is not None:
+            self.styles.table.save(Path(save_directory))
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """On another dataset keep the network and start new styles."""
@@ -326,19 +443,23 @@ class WZBCPolicy(ZBCPolicy):
                 config.partner_sampling,  # type: ignore[arg-type]
             )
 
-    def distances(self) -> np.ndarray:
-        """(N, N) distances of the training dataset's episodes over the configured features."""
+    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Checkpoints from before the draws' seed was kept start a new sequence of draws."""
+        draws = {f"draws.{key}": value for key, value in self.draws.state_dict().items()}
+        return {**draws, **super()._translate_checkpoint(state)}
+
+    def compared_keys(self) -> Sequence[str]:
+        """The features over which ν compares demonstrations.
+
+        Raises:
+            ValueError: If a configured feature is unknown.
+        """
         keys = self.config.similarity_keys or self.config.observation_keys
-        if self._trajectories is None or self._dataset_root is None:
-            raise RuntimeError(
-                "distances between episodes need the dataset: create the policy with dataset_meta"
-            )
-        unknown = [key for key in keys if key not in self._trajectories.columns]
+        known = [*self.config.observation_keys, ACTION]
+        unknown = [key for key in keys if key not in known]
         if unknown:
-            raise ValueError(
-                f"similarity_keys={keys}: {unknown} are not among {list(self._trajectories.columns)}"
-            )
-        return cached_distances(self._trajectories, keys, self._dataset_root)
+            raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
+        return keys
 
     def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """(B,) weighted loss of each frame under its pair's style, whose mean has algorithm 1's expectation.
@@ -352,7 +473,7 @@ class WZBCPolicy(ZBCPolicy):
             return super().frame_losses(batch)
         episodes = batch["episode_index"]
         self.styles.mark_trained(episodes)
-        self.sampler.set_candidates(self.styles.trained)
+        self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
         pairs = self.sampler.draw(episodes, self.draws.next())
         style = self.styles.embedding(pairs.styles)
         style = torch.where(pairs.relabelled[:, None], style.detach(), style)

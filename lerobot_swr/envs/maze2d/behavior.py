@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lerobot_swr.envs.maze2d.layouts import MazeLayout
+from lerobot_swr.envs.maze2d.layouts import LAYOUTS, MazeLayout
 
 
 def checkpoints_passed(positions: np.ndarray, layout: MazeLayout) -> str:
@@ -53,3 +53,9 @@ class MazeBehaviorRule:
     def __call__(self, observations: Mapping[str, np.ndarray]) -> str:
         """Label an episode from its ``observation.state`` (T, 2)."""
         return checkpoints_passed(observations["observation.state"], self.layout)
+
+
+# The rules by name, for --policy.behavior_rule=lerobot_swr.envs.maze2d.behavior:medium
+small = MazeBehaviorRule(LAYOUTS["small"])
+medium = MazeBehaviorRule(LAYOUTS["medium"])
+large = MazeBehaviorRule(LAYOUTS["large"])

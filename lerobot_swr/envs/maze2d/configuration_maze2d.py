@@ -1,8 +1,10 @@
 """Maze2D as a LeRobot environment: ``--env.type=maze2d --env.task=small|medium|large``."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import gymnasium as gym
+import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
@@ -12,6 +14,7 @@ from matplotlib.patches import Circle
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
+from lerobot_swr.envs.maze2d.dynamics import in_goal
 from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import get_layout
 
@@ -102,6 +105,11 @@ class Maze2DEnvConfig(TaskEnvConfig):
     def behavior_rule(self) -> BehaviorRule:
         """The checkpoints in the order in which they are first passed."""
         return MazeBehaviorRule(get_layout(self.task or ""))
+
+    def steps_to_end(self, observations: Mapping[str, np.ndarray]) -> int:
+        """Actions until the first state in the goal disc."""
+        reached = in_goal(observations[OBS_STATE], get_layout(self.task or ""))
+        return int(reached.argmax()) if reached.any() else len(reached)
 
     def draw_scene(self, axes: Axes) -> None:
         """Walls, door numbers and the goal."""

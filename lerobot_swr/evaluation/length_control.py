@@ -1,0 +1,111 @@
+"""Control of the episode length: do rollouts keep to a band of lengths, as the demonstrations in it do?"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from lerobot.envs import EnvConfig
+
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.evaluation.metrics import Histogram, Interval, histogram, l1_distance, l1_floor
+from lerobot_swr.trajectories import Trajectories
+
+BIN_WIDTH = 5  # steps
+TOLERANCE = 2  # steps beyond the band that still count as inside
+
+
+@dataclass(frozen=True)
+class LengthControlResult:
+    """Lengths of rollouts beside those of the demonstrations in a band.
+
+    Attributes:
+        band: Shortest and longest length, in frames of the demonstrations.
+        frames_after_end: Frames that demonstrations record after the environment would have ended them; added
+            to the rollouts' lengths so that both are counted alike.
+        n_demonstrations: Number of demonstrations in the band.
+        n_episodes: Number of rollouts.
+        l1: L1 distance of the rollouts' length histogram to that of the demonstrations in the band, 0 to 2.
+        l1_floor: L1 that a perfect reproducer of the demonstrations in the band would score on average,
+            drawing with replacement.
+        l1_floor_band: The central 95 % of that.
+        in_band: Share of rollouts within the band, ± `TOLERANCE` steps.
+        histogram: First length of a bin of `BIN_WIDTH` steps to share of the rollouts.
+        reference_histogram: The same for the demonstrations in the band.
+    """
+
+    band: tuple[int, int]
+    frames_after_end: int
+    n_demonstrations: int
+    n_episodes: int
+    l1: float
+    l1_floor: float
+    l1_floor_band: Interval
+    in_band: float
+    histogram: Histogram
+    reference_histogram: Histogram
+
+
+def frames_after_end(trajectories: Trajectories, env_cfg: EnvConfig) -> int:
+    """Median number of frames that demonstrations record after the environment would have ended them."""
+    if not isinstance(env_cfg, TaskEnvConfig):
+        return 0
+    steps = [env_cfg.steps_to_end(episode) for episode in trajectories.episodes()]
+    return int(np.median(trajectories.lengths - np.array(steps)))
+
+
+def evaluate_length_control(
+    rollout_lengths: Sequence[int],
+    demonstration_lengths: Sequence[int],
+    band: tuple[int, int],
+    after_end: int = 0,
+) -> LengthControlResult:
+    """Compare lengths of rollouts with those of the demonstrations in a band.
+
+    Args:
+        rollout_lengths: Actions of each rollout.
+        demonstration_lengths: Frames of every demonstration.
+        band: Shortest and longest allowed length, in frames of the demonstrations.
+        after_end: `frames_after_end`.
+
+    Raises:
+        ValueError: If no demonstration lies in the band.
+    """
+    low, high = band
+    reference = [n for n in demonstration_lengths if low <= n <= high]
+    if not reference:
+        raise ValueError(
+            f"length_band={[low, high]}: no demonstration has such a length; they have "
+            f"{min(demonstration_lengths)} to {max(demonstration_lengths)} frames"
+        )
+    lengths = [n + after_end for n in rollout_lengths]
+    expected, shown = (_bins(part, low) for part in (reference, lengths))
+    floor = l1_floor(expected, len(lengths))
+    return LengthControlResult(
+        band=(low, high),
+        frames_after_end=after_end,
+        n_demonstrations=len(reference),
+        n_episodes=len(lengths),
+        l1=l1_distance(histogram(shown), histogram(expected)),
+        l1_floor=floor.mean,
+        l1_floor_band=floor.band,
+        in_band=float(np.mean([low - TOLERANCE <= n <= high + TOLERANCE for n in lengths])),
+        histogram=dict(sorted(histogram(shown).items(), key=lambda item: int(item[0]))),
+        reference_histogram=dict(sorted(histogram(expected).items(), key=lambda item: int(item[0]))),
+    )
+
+
+def _bins(lengths: Sequence[int], low: int) -> list[str]:
+    """First length of each length's bin; bins start at the band's lower end."""
+    return [str(low + BIN_WIDTH * ((n - low) // BIN_WIDTH)) for n in lengths]
+
+
+def format_length_control(result: LengthControlResult) -> str:
+    """The figures, for the terminal."""
+    floor = result.l1_floor_band
+    return (
+        f"lengths         L1 {result.l1:.3f} to the {result.n_demonstrations} demonstrations of "
+        f"{result.band[0]} to {result.band[1]} frames (bins of {BIN_WIDTH}; perfect reproducer "
+        f"{result.l1_floor:.3f} [{floor.low:.3f}, {floor.high:.3f}])\n"
+        f"                {result.in_band:.3f} of {result.n_episodes} rollouts in that band ± {TOLERANCE} "
+        f"steps (counting {result.frames_after_end} frames that demonstrations record after the end)"
+    )

@@ -1,0 +1,132 @@
+"""Enlarges a cookbook by demonstrations that were not trained on."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import nn
+
+from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.policies.modeling_swr import ZBCPolicy
+from lerobot_swr.similarity import pairwise_distances
+from lerobot_swr.style_encoding import STARTS, encode_styles
+from lerobot_swr.style_table import MAX_NEIGHBOURS, make_style_table
+from lerobot_swr.trajectories import Trajectories
+
+CHUNK = 8  # episodes encoded at once; bounds memory
+
+
+@dataclass(frozen=True)
+class EncodedStyles:
+    """What was added to a cookbook.
+
+    Attributes:
+        episodes: Numbers of the new styles in the cookbook.
+        nearest: For each the trained episode nearest by ν.
+        errors: Mean squared error of the normalised action under the new style.
+        errors_of_nearest: The same under the style of the nearest trained episode.
+    """
+
+    episodes: list[int]
+    nearest: list[int]
+    errors: list[float]
+    errors_of_nearest: list[float]
+
+
+def add_demonstrations(
+    policy: ZBCPolicy,
+    preprocessor: Any,
+    training: Trajectories,
+    new: Trajectories,
+    chosen: list[int] | None = None,
+    robot_type: str | None = None,
+) -> EncodedStyles:
+    """Give demonstrations that were not trained on a style of their own; the network stays as it is.
+
+    Episodes of the training dataset that were left out of training get the style at their own place;
+    episodes of another dataset are appended, as are their rows of the table.
+
+    Args:
+        policy: The policy, changed in place.
+        preprocessor: The policy's inputs of raw observations and actions.
+        training: The dataset that the policy was trained on.
+        new: The dataset with the new demonstrations, which has the features of the training dataset.
+        chosen: Episodes of `new`; None takes all that have no style yet.
+        robot_type: Of the new dataset's metadata; finds the behaviour rule of this package's datasets.
+
+    Raises:
+        ValueError: If nothing is to be added, or a column of the table cannot be computed for `new`.
+    """
+    config, styles = policy.config, policy.styles
+    same = new.fingerprint([OBS_STATE]) == config.dataset_fingerprint
+    trained = styles.trained[: len(training)].bool().cpu().numpy()
+    if chosen is None:
+        chosen = np.flatnonzero(~trained).tolist() if same else list(range(len(new)))
+    already = [i for i in chosen if same and trained[i]]
+    if already or not chosen:
+        raise ValueError(
+            f"add={new.name!r}: {f'episodes {already}' if already else 'all episodes'} have a style already; "
+            "name the new ones with --episodes=[...], or another dataset"
+        )
+    added = new.subset(chosen)
+
+    candidates = np.flatnonzero(trained)
+    states = training.states(policy.compared_keys()) + added.states(policy.compared_keys())
+    distances = pairwise_distances(states)[len(training) :]  # (E, N + E)
+    ranked = candidates[np.argsort(distances[:, candidates], axis=1, kind="stable")[:, :STARTS]]
+    starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
+    keys = [*config.observation_keys, ACTION]
+    raw = ({key: torch.from_numpy(episode[key]) for key in keys} for episode in added.episodes())
+    frames = [{key: value for key, value in preprocessor(e).items() if key in keys} for e in raw]
+    encoded, errors, nearest_errors = [], [], []
+    for i in range(0, len(frames), CHUNK):
+        part = slice(i, i + CHUNK)
+        found = encode_styles(policy.network, frames[part], starts[part])
+        encoded.append(found[0])
+        errors.append(found[1])
+        nearest_errors.append(encode_styles(policy.network, frames[part], starts[part, :1], steps=0)[1])
+
+    first = len(styles)
+    numbers = list(chosen) if same else list(range(first, first + len(chosen)))
+    if not same:
+        _append_rows(policy, added, distances, len(training), robot_type)
+    with torch.no_grad():
+        styles.embedding.weight[numbers] = torch.cat(encoded)
+    styles.trained[numbers] = 1
+    return EncodedStyles(
+        numbers, ranked[:, 0].tolist(), torch.cat(errors).tolist(), torch.cat(nearest_errors).tolist()
+    )
+
+
+def _append_rows(
+    policy: ZBCPolicy, added: Trajectories, distances: np.ndarray, n_training: int, robot_type: str | None
+) -> None:
+    """Make room for new styles in the cookbook and describe them in the table."""
+    config, styles = policy.config, policy.styles
+    first = len(styles)
+    if styles.table is not None:
+        rule = dataset_behavior_rule(config.behavior_rule, robot_type)
+        rows = make_style_table(
+            added, distances[:, n_training:], rule, load_style_metrics(config.style_metrics)
+        )
+        missing = sorted(set(styles.table.columns) - set(rows.columns))
+        if missing:
+            raise ValueError(
+                f"add={added.name!r}: the columns {missing} of the checkpoint's table cannot be computed for "
+                "it; name the rule or metric with --behavior_rule or --style_metrics (module:function)"
+            )
+        # Rows of the new demonstrations start at `first`, those of the training dataset at 0.
+        numbers = np.concatenate([np.arange(n_training), first + np.arange(len(added))])
+        neighbours = [
+            [int(j) for j in numbers[np.argsort(row, kind="stable")] if j != first + i][:MAX_NEIGHBOURS]
+            for i, row in enumerate(distances)
+        ]
+        styles.table = styles.table.extended(replace(rows, neighbours=neighbours))
+    enlarged = nn.Embedding(first + len(added), config.style_dim, device=styles.embedding.weight.device)
+    with torch.no_grad():
+        enlarged.weight[:first] = styles.embedding.weight
+    styles.embedding = enlarged
+    styles.trained = torch.cat([styles.trained, styles.trained.new_zeros(len(added))])
+    config.num_added_styles += len(added)

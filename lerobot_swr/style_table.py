@@ -1,0 +1,195 @@
+"""The table of a checkpoint's demonstrations: one row per style, for filters, neighbours and named filters.
+
+It is made from the training dataset when a policy is created and travels with the checkpoint as
+``styles.json``, so that styles can be chosen where the dataset is not.
+"""
+
+import json
+import logging
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
+from lerobot.utils.constants import OBS_STATE, REWARD
+
+from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.filters import Value, column_kind, select
+from lerobot_swr.trajectories import Trajectories
+
+TABLE_FILE = "styles.json"
+SUCCESS = "next.success"
+OUTCOMES = (REWARD, SUCCESS)
+MAX_NEIGHBOURS = 50
+
+Metric = Callable[[Mapping[str, np.ndarray]], Value]
+"""Maps an episode's features, ``{"observation.state": (T, d), "action": (T, A), ...}``, to a value."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StyleTable:
+    """What is known of the demonstration behind each style.
+
+    Attributes:
+        columns: Name to N numbers, strings or truth values, one per episode.
+        neighbours: For each episode the others nearest to it by dissimilarity ν, nearest first, at most
+            `MAX_NEIGHBOURS`.
+        filters: Named filters; a rollout whose task string is such a name draws from that filter's styles.
+    """
+
+    columns: dict[str, list[Value]]
+    neighbours: list[list[int]]
+    filters: dict[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Number of styles."""
+        return len(self.neighbours)
+
+    def matches(self, text: str) -> np.ndarray:
+        """(N,) bool, the episodes that a filter keeps.
+
+        Raises:
+            FilterError: If the filter cannot be used on this table.
+        """
+        return select(text, self.columns)
+
+    def with_filter(self, name: str, text: str) -> "StyleTable":
+        """The table with a named filter more.
+
+        Raises:
+            ValueError: If the name is empty.
+            FilterError: If the filter cannot be used on this table.
+        """
+        if not name.strip():
+            raise ValueError(f"name={name!r}: a named filter needs a name, e.g. --name=slowly")
+        self.matches(text)
+        return replace(self, filters={**self.filters, name: text})
+
+    def without_filter(self, name: str) -> "StyleTable":
+        """The table without one of its named filters.
+
+        Raises:
+            ValueError: If there is no such filter.
+        """
+        if name not in self.filters:
+            raise ValueError(f"{name!r} is no named filter; known: {', '.join(self.filters) or 'none'}")
+        return replace(self, filters={key: text for key, text in self.filters.items() if key != name})
+
+    def extended(self, other: "StyleTable") -> "StyleTable":
+        """The table with the rows of `other` below, which has the same columns; filters are this table's."""
+        columns = {name: values + other.columns[name] for name, values in self.columns.items()}
+        columns["episode"] = list(range(len(self) + len(other)))
+        return replace(self, columns=columns, neighbours=self.neighbours + other.neighbours)
+
+    def save(self, folder: Path) -> None:
+        """Write the table into a checkpoint's folder, all or nothing."""
+        folder.mkdir(parents=True, exist_ok=True)
+        unfinished = folder / f".{TABLE_FILE}.{os.getpid()}"
+        unfinished.write_text(json.dumps(asdict(self)))
+        os.replace(unfinished, folder / TABLE_FILE)
+
+
+def make_style_table(
+    trajectories: Trajectories,
+    distances: np.ndarray,
+    rule: BehaviorRule | None = None,
+    metrics: Mapping[str, Metric] | None = None,
+) -> StyleTable:
+    """Compute the table of a dataset.
+
+    Columns: ``episode``; ``length`` (frames) and ``duration`` (s); ``path_length`` of the states (in their
+    units) and ``mean_speed`` (path length per second); ``return`` and ``success`` where the dataset has
+    ``next.reward`` and ``next.success``; ``first_k`` and ``last_k``, component k of the first and last state;
+    ``task``, where the dataset has task strings; ``behavior``, where there is a rule; and the metrics.
+
+    Args:
+        trajectories: The demonstrations.
+        distances: (N, N) distances of the demonstrations, or of any others in the columns.
+        rule: Labels a demonstration.
+        metrics: Name to user metric.
+
+    Raises:
+        ValueError: If a metric's value is no finite number, string or truth value, or its kind varies.
+    """
+    states = trajectories.states([OBS_STATE])
+    path_length = [float(np.linalg.norm(np.diff(s, axis=0), axis=1).sum()) for s in states]
+    moving = [max(len(s) - 1, 1) / trajectories.fps for s in states]  # seconds from first to last frame
+    columns: dict[str, list[Value]] = {
+        "episode": list(range(len(trajectories))),
+        "length": trajectories.lengths.tolist(),
+        "duration": (trajectories.lengths / trajectories.fps).tolist(),
+        "path_length": list(path_length),
+        "mean_speed": [path / seconds for path, seconds in zip(path_length, moving, strict=True)],
+    }
+    if REWARD in trajectories.columns:
+        columns["return"] = [float(episode[REWARD].sum()) for episode in trajectories.episodes()]
+    if SUCCESS in trajectories.columns:
+        columns["success"] = [bool(episode[SUCCESS].any()) for episode in trajectories.episodes()]
+    for k in range(states[0].shape[1]):
+        columns[f"first_{k}"] = [float(s[0, k]) for s in states]
+        columns[f"last_{k}"] = [float(s[-1, k]) for s in states]
+    if trajectories.tasks:
+        columns["task"] = list(trajectories.tasks)
+    named: dict[str, Metric] = {"behavior": rule} if rule is not None else {}
+    for name, metric in {**named, **(metrics or {})}.items():
+        columns[name] = _measured(name, metric, trajectories)
+    return StyleTable(columns, nearest_others(distances))
+
+
+def nearest_others(distances: np.ndarray) -> list[list[int]]:
+    """For each row the columns by growing distance, the row's own left out, at most `MAX_NEIGHBOURS`.
+
+    ν divides a row by a constant, so its order is that of the distances.
+    """
+    ranks = np.argsort(distances, axis=1, kind="stable")[:, : MAX_NEIGHBOURS + 1]
+    return [[j for j in row if j != i][:MAX_NEIGHBOURS] for i, row in enumerate(ranks.tolist())]
+
+
+def _measured(name: str, metric: Metric, trajectories: Trajectories) -> list[Value]:
+    values: list[Value] = []
+    for i, episode in enumerate(trajectories.episodes()):
+        value: Any = metric(episode)
+        value = value.item() if isinstance(value, np.generic | np.ndarray) and np.size(value) == 1 else value
+        if not isinstance(value, bool | int | float | str) or value != value or value in (np.inf, -np.inf):
+            raise ValueError(
+                f"style_metrics: {name!r} of episode {i} is {value!r}; expected a finite number, a string or "
+                "a truth value"
+            )
+        values.append(value)
+    kinds = {column_kind([value]) for value in values}
+    if len(kinds) > 1:
+        raise ValueError(
+            f"style_metrics: {name!r} is a {' here and a '.join(sorted(kinds))} there; keep to one"
+        )
+    return values
+
+
+def load_style_table(path: str | Path, **hub_options: Any) -> StyleTable | None:
+    """The table of a checkpoint, or None if it has none.
+
+    Args:
+        path: The checkpoint's folder, or its repository on the Hub.
+        **hub_options: Options of `hf_hub_download`.
+
+    Raises:
+        ValueError: If the file is damaged.
+    """
+    if Path(path).is_dir():
+        file = Path(path) / TABLE_FILE
+        if not file.is_file():
+            return None
+    else:
+        try:
+            file = Path(hf_hub_download(repo_id=str(path), filename=TABLE_FILE, **hub_options))
+        except (EntryNotFoundError, LocalEntryNotFoundError):
+            return None
+    try:
+        return StyleTable(**json.loads(file.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{file}: damaged table ({error}); copy the checkpoint again") from error
