@@ -1,4 +1,4 @@
-"""Steps per second of `lerobot-train` for zbc, wzbc and LeRobot's act (its default network) on one dataset."""
+"""Steps per second of `lerobot-train`: zbc and wzbc beside LeRobot's act with its default network."""
 
 import os
 import re
@@ -21,13 +21,19 @@ def main() -> None:
             command = [
                 str(Path(sys.executable).with_name("lerobot-train")),
                 f"--policy.type={policy_type}",
-                *("--policy.device=cpu", "--policy.push_to_hub=false", "--dataset.repo_id=local/only_forward"),
+                *(
+                    "--policy.device=cpu",
+                    "--policy.push_to_hub=false",
+                    "--dataset.repo_id=local/only_forward",
+                ),
                 *(f"--dataset.root={root}", f"--batch_size={batch_size}", "--num_workers=0"),
                 *(f"--steps={steps}", f"--log_freq={steps // 2}", "--save_checkpoint=false"),
                 f"--output_dir={folder}/{policy_type}",
                 *more,
             ]
-            run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"})
+            run = subprocess.run(
+                command, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"}
+            )
             if run.returncode != 0:
                 sys.exit(run.stderr[-3000:])
             timings = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", run.stdout + run.stderr)

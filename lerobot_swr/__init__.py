@@ -15,5 +15,6 @@ Importing this package registers the environment, policy and optimizer configura
 
 __version__ = "0.1.0"
 
+import lerobot_swr.envs.d3il.configuration_d3il
 import lerobot_swr.envs.maze2d.configuration_maze2d
 import lerobot_swr.policies.configuration_swr  # noqa: F401

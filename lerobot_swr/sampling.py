@@ -33,10 +33,10 @@ class Pairs:
 class SimilarityWeightedSampler:
     """Draws pairs (i, j) for given episodes i, so that on average a style j learns as algorithm 1 has it.
 
-    ``uniform`` is the paper's way: j ≠ i uniformly at probability p, weighted by W(τ_i, τ_j), else j = i. Where
-    demonstrations differ, W is almost 0 and so a share p of the batch teaches almost nothing. ``weighted`` draws
-    the pair by its share in the same expectation, 1 - p for j = i and p W(τ_i, τ_j) / (M - 1) for each of the
-    M - 1 others, and weights every frame by the sum of these shares: no frame is wasted.
+    ``uniform`` is the paper's way: j ≠ i uniformly at probability p, weighted by W(τ_i, τ_j), else j = i.
+    Where demonstrations differ, W is almost 0 and so a share p of the batch teaches almost nothing.
+    ``weighted`` draws the pair by its share in the same expectation, 1 - p for j = i and p W(τ_i, τ_j) / (M
+    - 1) for each of the M - 1 others, and weights every frame by the sum of these shares: no frame is wasted.
 
     Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.
     The normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
@@ -134,8 +134,8 @@ class StepGenerator(nn.Module):
     """A fresh random generator for every training step, a pure function of seed, process and step.
 
     Seed and step are buffers, so they travel with a checkpoint and a resumed run draws what the uninterrupted
-    one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making a
-    data loader's iterator draws from it, once more in a resumed run than in one that goes on.)
+    one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making
+    a data loader's iterator draws from it, once more in a resumed run than in one that goes on.)
     """
 
     def __init__(self) -> None:

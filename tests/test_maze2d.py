@@ -1,5 +1,7 @@
 """Maze2D: dynamics, environments, behaviour rule."""
 
+from itertools import pairwise
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -141,8 +143,7 @@ def test_the_rule_names_doors_in_the_order_in_which_they_are_first_passed():
     def walk(*points):
         corners = np.array([(0.5, 0.08), *points])
         return np.concatenate(
-            [np.linspace(a, b, 20, endpoint=False) for a, b in zip(corners[:-1], corners[1:], strict=True)]
-            + [corners[-1:]]
+            [np.linspace(a, b, 20, endpoint=False) for a, b in pairwise(corners)] + [corners[-1:]]
         )
 
     def through(number):

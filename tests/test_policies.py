@@ -165,9 +165,7 @@ def test_saving_and_loading_keeps_the_actions(make_tiny_policy, small_maze_meta,
 
 
 @pytest.mark.parametrize("policy_type", STYLE_POLICIES)
-def test_styles_are_constant_in_an_episode_and_independent_across_environments(
-    make_tiny_policy, policy_type
-):
+def test_styles_are_constant_in_an_episode_and_independent_across_environments(make_tiny_policy, policy_type):
     """Each environment acts with its one style, drawn for itself, whatever the others do."""
     policy = train_briefly(make_tiny_policy(policy_type))
     observations = make_batch(64)
@@ -188,9 +186,7 @@ def test_styles_are_constant_in_an_episode_and_independent_across_environments(
 def test_inference_options_are_flags_of_the_loaded_policy(make_tiny_policy, small_maze_meta, tmp_path):
     """A loaded checkpoint takes style_sampling and style_episodes."""
     policy = train_briefly(make_tiny_policy("zbc"))
-    loaded = reload(
-        policy, small_maze_meta, tmp_path / "c", style_sampling="fixed", style_episodes="[3,1]"
-    )
+    loaded = reload(policy, small_maze_meta, tmp_path / "c", style_sampling="fixed", style_episodes="[3,1]")
     loaded.reset()
     loaded.select_action(make_batch(3))
     assert loaded.styles.active.tolist() == [3, 1, 3]
@@ -244,9 +240,7 @@ def test_constant_dimensions_are_centred_not_blown_up(make_tiny_policy, small_ma
     stats["observation.environment_state"]["std"] = np.zeros(2)
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=stats)
     goal = torch.tensor([[0.5, 0.92]])
-    batch = preprocessor(
-        {"observation.state": goal, "observation.environment_state": goal, "action": goal}
-    )
+    batch = preprocessor({"observation.state": goal, "observation.environment_state": goal, "action": goal})
     assert batch["observation.environment_state"].abs().max() < 1e-3
 
 
@@ -344,7 +338,7 @@ def test_nan_states_are_refused_before_training(small_maze, tmp_path):
     table.at[10, "observation.state"] = np.array([np.nan, 0.0], dtype=np.float32)
     table.to_parquet(file)
     meta = LeRobotDatasetMetadata("local/broken", root=root)
-    with pytest.raises(ValueError, match="'observation.state' is NaN.*episode 0, frame 10"):
+    with pytest.raises(ValueError, match=r"'observation.state' is NaN.*episode 0, frame 10"):
         make_policy(make_policy_config("bc", device="cpu"), ds_meta=meta)
 
 

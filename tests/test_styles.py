@@ -9,7 +9,7 @@ from lerobot_swr.style_selection import StyleSelection
 from lerobot_swr.styles import StyleCookbook
 
 
-def make_cookbook(trained=range(6), **options) -> StyleCookbook:
+def make_cookbook(trained=(0, 1, 2, 3, 4, 5), **options) -> StyleCookbook:
     torch.manual_seed(0)
     cookbook = StyleCookbook(6, style_dim=3, init_scale=0.1, **options)
     cookbook.mark_trained(torch.tensor(list(trained), dtype=torch.long))

@@ -72,11 +72,14 @@ def test_training_figures_are_logged(lerobot_train_command, small_maze, tmp_path
 
 
 def test_two_processes_train_one_cookbook(small_maze, tmp_path):
-    """accelerate with 2 processes: the saved checkpoint knows every episode that either process saw."""
+    """Two processes (DDP): the saved checkpoint knows every episode that either process saw.
+
+    Started with torchrun: ``accelerate launch --cpu --num_processes=2`` starts a single process on one
+    machine.
+    """
     output_dir = tmp_path / "run"
     command = [
-        *("-m", "accelerate.commands.launch", "--cpu", "--num_processes=2", "--num_machines=1"),
-        *("--mixed_precision=no", "--dynamo_backend=no", "--main_process_port=0"),
+        *("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"),
         str(Path(sys.executable).with_name("lerobot-train")),
         *train_flags("wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5"),
     ]

@@ -1,7 +1,8 @@
 """``lerobot-swr-dataset``: write one of the package's demonstration datasets.
 
-Example:
+Examples:
     lerobot-swr-dataset --task=medium_maze-only_forward --root=data/only_forward --seed=0
+    lerobot-swr-dataset --task=avoiding --from_d3il=recordings/avoiding --root=data/recorded_avoiding
 """
 
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.demos.catalog import get_recipe
+from lerobot_swr.demos.d3il_converter import recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 
 
@@ -19,7 +21,9 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 class DatasetCommand:
     """Options of ``lerobot-swr-dataset``."""
 
-    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast.
+    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast;
+    # d3il_avoiding, d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning.
+    # With from_d3il: avoiding or aligning.
     task: str
     # Folder of the new dataset.
     root: Path
@@ -29,12 +33,19 @@ class DatasetCommand:
     repo_id: str | None = None
     # Replace a dataset that is already in the folder.
     overwrite: bool = False
+    # Convert the D3IL benchmark's own recordings (*.pkl) in this folder instead.
+    from_d3il: Path | None = None
+    # With from_d3il: a pickled list of the file names to convert; default: all of them.
+    file_list: Path | None = None
 
 
 @parser.wrap()
 def write(cfg: DatasetCommand) -> None:
     """Write the dataset and print its behaviour histogram."""
-    recipe = get_recipe(cfg.task)
+    if cfg.from_d3il is not None:
+        recipe = recorded_recipe(cfg.from_d3il, cfg.task, cfg.file_list)
+    else:
+        recipe = get_recipe(cfg.task)
     histogram = write_dataset(recipe, cfg.root, cfg.seed, cfg.repo_id, cfg.overwrite)
     total = sum(histogram.values())
     print(f"{total} episodes of {recipe.name} in {cfg.root}")

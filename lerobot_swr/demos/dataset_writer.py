@@ -4,6 +4,8 @@ import json
 import shutil
 import tempfile
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +21,9 @@ def write_dataset(
 ) -> Counter[str]:
     """Write a dataset into `root`.
 
-    The dataset is built in a temporary folder beside `root` and moved there when it is complete, so that an
-    interrupted run leaves nothing half-written and an overwritten dataset is replaced at once.
+    The dataset is built in a hidden work folder beside `root` and moved there when it is complete, so that an
+    interrupted run leaves nothing half-written and an overwritten dataset is replaced at once. Where the
+    recipe keeps finished episodes in the work folder, the next run with the same seed continues from them.
 
     Args:
         recipe: What to write.
@@ -36,9 +39,15 @@ def write_dataset(
         FileExistsError: If `root` exists and is not to be overwritten, or is no dataset.
     """
     check_root(root, overwrite)
-    root.parent.mkdir(parents=True, exist_ok=True)
+    work_dir = root.parent / f".{root.name}-{recipe.name}-seed{seed}"
+    work_dir.mkdir(parents=True, exist_ok=True)
+    for leftover in work_dir.glob("building-*"):
+        shutil.rmtree(leftover)  # of a run that was killed
     histogram: Counter[str] = Counter()
-    with tempfile.TemporaryDirectory(prefix=f".{root.name}-", dir=root.parent) as workspace:
+    with (
+        _removed_if_useless(work_dir),
+        tempfile.TemporaryDirectory(prefix="building-", dir=work_dir) as workspace,
+    ):
         dataset = LeRobotDataset.create(
             repo_id=repo_id or f"local/{recipe.name}",
             fps=recipe.fps,
@@ -53,7 +62,10 @@ def write_dataset(
         disable_progress_bars()  # those of `datasets`, one per episode
         try:
             for demonstration in tqdm(
-                recipe.demonstrations(seed), total=recipe.n_episodes, desc=recipe.name, unit="episode"
+                _demonstrations(recipe, seed, work_dir),
+                total=recipe.n_episodes,
+                desc=recipe.name,
+                unit="episode",
             ):
                 _add_episode(dataset, demonstration, recipe.instruction)
                 histogram[recipe.behavior_rule(demonstration.observations)] += 1
@@ -63,7 +75,25 @@ def write_dataset(
         if root.exists():
             shutil.rmtree(root)
         (Path(workspace) / "dataset").rename(root)
+    shutil.rmtree(work_dir)
     return histogram
+
+
+def _demonstrations(recipe: DatasetRecipe, seed: int, work_dir: Path) -> Iterator[Demonstration]:
+    if recipe.resumable_demonstrations is None:
+        return recipe.demonstrations(seed)
+    return recipe.resumable_demonstrations(seed, work_dir / "episodes")
+
+
+@contextmanager
+def _removed_if_useless(work_dir: Path) -> Iterator[None]:
+    """Remove the work folder after an error or an interruption, unless it holds finished episodes."""
+    try:
+        yield
+    except BaseException:
+        if not any(path.is_file() for path in work_dir.rglob("*")):
+            shutil.rmtree(work_dir)
+        raise
 
 
 def _add_episode(dataset: LeRobotDataset, demonstration: Demonstration, instruction: str) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -36,6 +37,9 @@ class DatasetRecipe:
         n_episodes: Number of demonstrations.
         demonstrations: Maps a seed to the episodes, in their order in the dataset. Deterministic in the seed.
         behavior_rule: Labels an episode of this dataset.
+        resumable_demonstrations: For a source that takes long, if not None: the same episodes, made on all
+            cores; finished ones are kept in the folder given, and those that an interrupted run with the same
+            seed left there are used.
     """
 
     name: str
@@ -46,3 +50,4 @@ class DatasetRecipe:
     n_episodes: int
     demonstrations: Callable[[int], Iterator[Demonstration]]
     behavior_rule: BehaviorRule
+    resumable_demonstrations: Callable[[int, Path], Iterator[Demonstration]] | None = None

@@ -69,6 +69,5 @@ class TaskEnvConfig(EnvConfig):
 
 
 def _make_one(config: TaskEnvConfig) -> gym.Env:
-    """One sub-environment. The configuration goes along so that a worker process registers its Gymnasium
-    id."""
+    # The configuration goes along so that a worker process, unpickling it, registers its Gymnasium id.
     return gym.make(config.gym_id, disable_env_checker=config.disable_env_checker, **config.gym_kwargs)

@@ -215,8 +215,8 @@ class WZBCConfig(ZBCConfig):
     beta: float = 10.0
     # Probability of relabelling a frame with another demonstration's style; 0 is ZBC.
     p: float = 0.8
-    # Draw pairs by their share in the expected loss ("weighted"), or partners uniformly with the loss weighted
-    # ("uniform", the paper: same expectation, but a share p of the batch teaches almost nothing).
+    # Draw pairs by their share in the expected loss ("weighted"), or partners uniformly with the loss
+    # weighted ("uniform", the paper: same expectation, but a share p of the batch teaches almost nothing).
     partner_sampling: str = "weighted"
     # Divide distances by the farthest episode of each demonstration ("row", the paper) or of all ("global").
     similarity_normalization: str = "row"

@@ -465,9 +465,9 @@ class WZBCPolicy(ZBCPolicy):
         """(B,) weighted loss of each frame under its pair's style, whose mean has algorithm 1's expectation.
 
         Figures to log: ``own_style_loss``, the mean squared error of frames under their own style;
-        ``relabelled_loss``, the mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``, the mean
-        of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates, whichever way
-        pairs are drawn, and defined for every batch: read their averages over time.
+        ``relabelled_loss``, the mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``,
+        the mean of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates,
+        whichever way pairs are drawn, and defined for every batch: read their averages over time.
         """
         if not self.training or self.sampler is None:
             return super().frame_losses(batch)

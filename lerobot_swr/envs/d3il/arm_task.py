@@ -1,0 +1,125 @@
+"""What the two D3IL tasks share as Gymnasium environments: the set-point, the clock and the pictures."""
+
+import abc
+from typing import Any, ClassVar, SupportsFloat
+
+import gymnasium as gym
+import numpy as np
+
+from lerobot_swr.envs.d3il.dependencies import mujoco
+from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, FPS
+from lerobot_swr.envs.d3il.rendering import OffscreenCamera
+from lerobot_swr.envs.d3il.simulation import ArmSimulation
+
+Observation = dict[str, np.ndarray]
+
+_OBSERVATION_BOUND = (
+    100.0  # metres; far outside of anything that can be reached, but finite as Gymnasium wants it
+)
+
+
+class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
+    """An arm whose desired tool position is moved by the actions, 35 ms of physics at a time.
+
+    Args:
+        model: The compiled scene.
+        start_tool: (3,) tool position in the start pose, which is also the first desired position.
+        n_axes: How many coordinates of the desired position the actions change (2: xy, 3: xyz).
+        environment_state_size: Length of the observation's ``environment_state``.
+        render_mode: ``"rgb_array"`` or None.
+        render_height: Of the pictures, in pixels.
+        render_width: Of the pictures, in pixels.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  as Gymnasium declares it
+    task: ClassVar[str]
+    task_description: ClassVar[str]
+
+    def __init__(
+        self,
+        model: "mujoco.MjModel",
+        start_tool: tuple[float, float, float],
+        n_axes: int,
+        environment_state_size: int,
+        render_mode: str | None,
+        render_height: int,
+        render_width: int,
+    ):
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"render_mode={render_mode!r}: the D3IL tasks know None and 'rgb_array'")
+        self.render_mode = render_mode
+        self._picture_size = (render_height, render_width)
+        self._camera: OffscreenCamera | None = None
+        self._simulation = ArmSimulation(model)
+        self._start_tool = np.array(start_tool)
+        self._desired = self._start_tool.copy()
+        self._n_axes = n_axes
+        self.action_space = gym.spaces.Box(-ACTION_LIMIT_M, ACTION_LIMIT_M, (n_axes,), np.float32)
+        self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]
+            {
+                key: gym.spaces.Box(-_OBSERVATION_BOUND, _OBSERVATION_BOUND, (size,), np.float32)
+                for key, size in (("agent_pos", 2 * n_axes), ("environment_state", environment_state_size))
+            }
+        )
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Put the arm into its start pose and begin an episode; the class says what the arguments do."""
+        super().reset(seed=seed)
+        self._desired = self._start_tool.copy()
+        self._begin_episode(options or {})
+        return self._observation(), self._info()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Move the desired tool position by `action` (n_axes,) in metres, clipped, and let 35 ms pass."""
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (self._n_axes,) or not np.isfinite(action).all():
+            raise ValueError(
+                f"action={action!r}: the {self.task} task takes {self._n_axes} finite numbers, the change of "
+                "the desired tool position in metres"
+            )
+        self._desired[: self._n_axes] += np.clip(action, -ACTION_LIMIT_M, ACTION_LIMIT_M)
+        self._simulation.advance(self._desired)
+        self._judge()
+        info = self._info()
+        return self._observation(), self._reward(), self._is_over(), False, info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """(height, width, 3) uint8 picture, or None without a render mode."""
+        if self.render_mode is None:
+            return None
+        if self._camera is None:
+            self._camera = OffscreenCamera(self._simulation.model, *self._picture_size)
+        return self._camera.picture(self._simulation.data)
+
+    def close(self) -> None:
+        """Free the OpenGL context, if any picture was made."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+    def _agent_pos(self) -> np.ndarray:
+        """(2 n_axes,) desired, then actual tool position."""
+        actual = self._simulation.tool_position[: self._n_axes]
+        return np.concatenate([self._desired[: self._n_axes], actual]).astype(np.float32)
+
+    @abc.abstractmethod
+    def _begin_episode(self, options: dict[str, Any]) -> None:
+        """Reset the simulation and what is remembered of the episode."""
+
+    @abc.abstractmethod
+    def _observation(self) -> Observation: ...
+
+    @abc.abstractmethod
+    def _judge(self) -> None:
+        """Update what is remembered of the episode after a step."""
+
+    @abc.abstractmethod
+    def _info(self) -> dict[str, Any]: ...
+
+    @abc.abstractmethod
+    def _reward(self) -> float: ...
+
+    @abc.abstractmethod
+    def _is_over(self) -> bool: ...

@@ -1,0 +1,142 @@
+"""The D3IL tasks as a LeRobot environment: ``--env.type=d3il --env.task=avoiding|aligning``.
+
+Importing this module needs neither MuJoCo nor numba; making an environment does.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.envs.configs import EnvConfig
+from lerobot.envs.utils import freeze_after_episode_end
+from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Rectangle
+
+from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.d3il.behavior import aligning_behavior, avoiding_behavior
+from lerobot_swr.envs.d3il.layouts import (
+    ALIGNING_EPISODE_LENGTH,
+    AVOIDING_EPISODE_LENGTH,
+    BOX_POSITION_RANGE,
+    FINISH_LINE_Y,
+    FPS,
+    OBSTACLES,
+    TARGET_POSITION_RANGE,
+)
+from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
+
+GYM_IDS = {"avoiding": "lerobot_swr/D3IL-Avoiding-v0", "aligning": "lerobot_swr/D3IL-Aligning-v0"}
+EPISODE_LENGTHS = {"avoiding": AVOIDING_EPISODE_LENGTH, "aligning": ALIGNING_EPISODE_LENGTH}
+_SIZES = {"avoiding": (2, 4, 19), "aligning": (3, 6, 14)}  # action, state, environment state
+_ENTRY_POINTS = {"avoiding": "avoiding:AvoidingEnv", "aligning": "aligning:AligningEnv"}
+
+for _task, _gym_id in GYM_IDS.items():
+    if _gym_id not in gym.registry:
+        gym.register(
+            id=_gym_id,
+            entry_point=f"lerobot_swr.envs.d3il.{_ENTRY_POINTS[_task]}",
+            max_episode_steps=EPISODE_LENGTHS[_task],
+        )
+
+
+@EnvConfig.register_subclass("d3il")
+@dataclass
+class D3ILEnvConfig(TaskEnvConfig):
+    """Configuration of the D3IL tasks; `AvoidingEnv` and `AligningEnv` document them.
+
+    The control rate is 1 / 0.035 s = 28.57 Hz; LeRobot stores whole Hz, so `fps` is 29. It only sets the
+    timestamps of datasets and the speed of videos.
+    """
+
+    # "avoiding" or "aligning".
+    task: str | None = "avoiding"
+    fps: int = FPS
+    # Step limit of an episode; default: the benchmark's, 250 for avoiding and 400 for aligning.
+    episode_length: int | None = None
+
+    # Size of the rendered picture, in pixels.
+    render_height: int = 480
+    render_width: int = 640
+    render_mode: str = "rgb_array"
+
+    features: dict[str, PolicyFeature] = field(default_factory=dict)
+    features_map: dict[str, str] = field(
+        default_factory=lambda: {
+            ACTION: ACTION,
+            "agent_pos": OBS_STATE,
+            "environment_state": OBS_ENV_STATE,
+        }
+    )
+
+    def __post_init__(self) -> None:
+        """Check the values and fill in what depends on the task.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        if self.task not in GYM_IDS:
+            raise ValueError(f"task={self.task!r}: the d3il environment knows {', '.join(GYM_IDS)}")
+        if self.episode_length is None:
+            self.episode_length = EPISODE_LENGTHS[self.task]
+        if self.episode_length < 1:
+            raise ValueError(f"episode_length={self.episode_length}: expected at least 1 step")
+        action, state, environment_state = _SIZES[self.task]
+        self.features = {
+            ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(action,)),
+            "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(state,)),
+            "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(environment_state,)),
+        }
+
+    @property
+    def gym_id(self) -> str:
+        """Gymnasium id, with the module that registers it, since worker processes import nothing else."""
+        return f"{self.package_name}:{GYM_IDS[self.task or '']}"
+
+    @property
+    def gym_kwargs(self) -> dict:
+        """Arguments for `gymnasium.make`."""
+        return {
+            "render_mode": self.render_mode,
+            "render_height": self.render_height,
+            "render_width": self.render_width,
+            "max_episode_steps": self.episode_length,
+        }
+
+    def behavior_rule(self) -> BehaviorRule:
+        """Avoiding: the gaps taken, like ``top-mid-bottom``. Aligning: ``inside`` or ``outside``."""
+        return avoiding_behavior if self.task == "avoiding" else aligning_behavior
+
+    def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(T, 2) path in the table's plane as pictures show it, y to the right: the tool's or the box's."""
+        if self.task == "avoiding":
+            return observations[OBS_STATE][:, [3, 2]]
+        return observations[OBS_ENV_STATE][:, [1, 0]]
+
+    def draw_scene(self, axes: Axes) -> None:
+        """Obstacles and finish line, or the areas where box and target start; the robot is at the top."""
+        if self.task == "avoiding":
+            for obstacle in OBSTACLES:
+                axes.add_patch(Circle((obstacle.y, obstacle.x), obstacle.radius, color="tab:red"))
+            axes.axvline(FINISH_LINE_Y, color="tab:green", linewidth=2)
+            axes.set(xlim=(-0.3, 0.4), ylim=(0.8, 0.2))
+        else:
+            for (x_range, y_range), colour in (
+                (BOX_POSITION_RANGE, "tab:blue"),
+                (TARGET_POSITION_RANGE, "tab:green"),
+            ):
+                corner, size = (y_range[0], x_range[0]), (y_range[1] - y_range[0], x_range[1] - x_range[0])
+                axes.add_patch(Rectangle(corner, *size, color=colour, alpha=0.15))
+            axes.set(xlim=(-0.4, 0.5), ylim=(0.75, 0.25))
+        axes.set(xlabel="y (m)", ylabel="x (m)")
+
+    def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
+        """All environments in this process, stepped by one thread per core."""
+        make_one = partial(
+            gym.make, self.gym_id, disable_env_checker=self.disable_env_checker, **self.gym_kwargs
+        )
+        return ThreadVectorEnv([freeze_after_episode_end(make_one) for _ in range(n_envs)])
