@@ -12,7 +12,9 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import make_policy
 
+from lerobot_swr.behaviors import dataset_behavior_rule
 from lerobot_swr.cli import styles as styles_command
+from lerobot_swr.demos.catalog import RECIPES
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
@@ -271,3 +273,11 @@ def test_bad_metrics_and_damaged_tables_are_named(make_tiny_policy, checkpoint):
     (checkpoint / "styles.json").write_text(json.dumps({**json.loads(content), "neighbours": [[]]}))
     with pytest.raises(ValueError, match="1 rows, the checkpoint 6 styles"):
         reload(checkpoint)
+
+
+@pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES.keys())
+def test_every_dataset_of_the_package_finds_its_own_rule(recipe):
+    """By its robot_type, without a flag."""
+    rule = dataset_behavior_rule(None, recipe.robot_type)
+    assert type(rule) is type(recipe.behavior_rule)
+    assert getattr(rule, "layout", rule) == getattr(recipe.behavior_rule, "layout", recipe.behavior_rule)

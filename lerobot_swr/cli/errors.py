@@ -21,9 +21,8 @@ def explain_errors(command: Callable[[], None]) -> Callable[[], None]:
         except (ValueError, OSError, ParsingError) as error:
             if os.environ.get("LEROBOT_SWR_DEBUG"):
                 raise
-            # The parser wraps what a configuration's own checks say.
-            told = error.__cause__ if isinstance(error, ParsingError) and error.__cause__ else error
-            print(f"error: {told}", file=sys.stderr)
+            cause = error.__cause__ if isinstance(error, ParsingError) else None  # raised in a __post_init__
+            print(f"error: {cause or error}", file=sys.stderr)
             sys.exit(2)
 
     return wrapper

@@ -109,7 +109,7 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
         name=name,
         instruction=ALIGNING_DESCRIPTION,
         fps=FPS,
-        robot_type="d3il_panda",
+        robot_type="d3il_aligning",
         features={
             "observation.state": ("desired_x", "desired_y", "desired_z", "x", "y", "z"),
             "observation.environment_state": ALIGNING_SCENE_NAMES,

@@ -147,7 +147,7 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
         name=name,
         instruction=AVOIDING_DESCRIPTION,
         fps=FPS,
-        robot_type="d3il_panda",
+        robot_type="d3il_avoiding",
         features={
             "observation.state": ("desired_x", "desired_y", "x", "y"),
             "observation.environment_state": AVOIDING_SCENE_NAMES,
