@@ -203,7 +203,7 @@ def test_missing_folders_and_foreign_datasets_are_named(
     write_dataset(_recipe("three", "small", {"10": 3}, steady), tmp_path / "three")
     write_dataset(_recipe("six", "small", {"10": 6}, steady), tmp_path / "six", seed=1)
     for policy, root, message in (
-        (trained_zbc, tmp_path / "nowhere", "no LeRobot dataset there"),
+        (trained_zbc, tmp_path / "nowhere", "no such folder"),
         (tmp_path, small_maze, "no config.json in this folder"),
         (trained_zbc, tmp_path / "three", "has 3 episodes, but the checkpoint has styles of 6"),
         (trained_zbc, tmp_path / "six", "is not the dataset that the checkpoint was trained on"),

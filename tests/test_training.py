@@ -114,3 +114,22 @@ def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_co
     ]
     lerobot_train_command(*train_flags("wzbc", small_maze, tmp_path / "run", 2, *flags))
     assert not load(tmp_path / "run").config.residual
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--policy.p=1.5",), "p=1.5: the relabelling probability must lie in"),
+        (("--policy.beta=-1",), "beta=-1"),
+        (("--policy.style_sampling=some",), "style_sampling='some'"),
+        (("--dataset.root=nowhere",), "dataset.root='nowhere': no such folder"),
+    ],
+)
+def test_the_command_names_bad_values(lerobot_train_command, small_maze, tmp_path, capfd, flags, message):
+    """LeRobot's command ends before training, and says key and value, not only the class."""
+    kept = [flag for flag in train_flags("wzbc", small_maze, tmp_path / "run", 5) if "root" not in flag]
+    root = () if any("root" in flag for flag in flags) else (f"--dataset.root={small_maze}",)
+    with pytest.raises((SystemExit, ValueError)):
+        lerobot_train_command(*kept, *root, *flags)
+    assert message in "".join(capfd.readouterr())
+    assert not (tmp_path / "run").exists()

@@ -12,6 +12,7 @@ from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import OBS_STATE
 
+from lerobot_swr.configuration import check_dataset_folder, tells_bad_values
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import check_beta, check_normalization
@@ -65,6 +66,7 @@ class BCConfig(PreTrainedConfig):
     # Hash of the training dataset's states; tells resuming from fine-tuning on other data.
     dataset_fingerprint: str | None = None
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the values.
 
@@ -72,6 +74,7 @@ class BCConfig(PreTrainedConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
+        check_dataset_folder()
         for key in ("hidden_dim", "num_hidden"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
@@ -170,6 +173,7 @@ class ZBCConfig(BCConfig):
     # Number of styles that were encoded for episodes of other datasets, after those of the training dataset.
     num_added_styles: int = 0
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the values.
 
@@ -224,6 +228,7 @@ class WZBCConfig(ZBCConfig):
     # the network sees.
     similarity_keys: list[str] | None = None
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the values.
 

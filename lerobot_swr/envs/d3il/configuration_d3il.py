@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.d3il.behavior import aligning_behavior, avoiding_behavior
 from lerobot_swr.envs.d3il.layouts import (
@@ -73,6 +74,7 @@ class D3ILEnvConfig(TaskEnvConfig):
         }
     )
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the values and fill in what depends on the task.
 

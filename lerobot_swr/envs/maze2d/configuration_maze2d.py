@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.dynamics import in_goal
@@ -67,6 +68,7 @@ class Maze2DEnvConfig(TaskEnvConfig):
         }
     )
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check every value now, before any environment or worker process is started.
 
