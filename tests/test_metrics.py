@@ -63,6 +63,13 @@ def test_the_stratified_floor_is_zero_for_full_rounds_and_exact_in_between():
     assert l1_floor(["a", "b", "b"], 2, stratified=True).mean == pytest.approx(exact, abs=0.01)
 
 
+def test_the_floor_knows_which_demonstrations_are_drawn():
+    """Drawing only "a" where "a" and "b" were demonstrated can not come nearer than L1 = 1."""
+    for stratified in (False, True):
+        floor = l1_floor(["a", "b"], 10, stratified=stratified, drawn_from=["a"])
+        assert floor.mean == pytest.approx(1)
+
+
 def test_wilsons_interval_matches_its_formula():
     """Against the closed form with z = 1.96 for 95 of 100."""
     p, n, z = 0.95, 100, 1.959964

@@ -251,6 +251,7 @@ def test_the_papers_literal_network_is_one_flag_set():
         residual=False,
         lr_schedule="constant",
         style_init_scale=1.0,
+        partner_sampling="uniform",
         normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"},
         device="cpu",
     )

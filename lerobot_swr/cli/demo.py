@@ -112,7 +112,7 @@ def demo(cfg: DemoCommand) -> None:
 
 def _training(cfg: DemoCommand, policy: str, dataset: str) -> Training:
     steps = {"bc": cfg.bc_steps, "zbc": cfg.zbc_steps, "wzbc": cfg.wzbc_steps}[policy]
-    output_dir = cfg.output_dir / "train" / f"{dataset}-{policy}-{steps}"
+    output_dir = cfg.output_dir / "train" / f"{dataset}-{policy}-{steps}-seed{cfg.seed}"
     command = (
         "lerobot-train",
         f"--policy.type={policy}",
@@ -134,7 +134,7 @@ def _train_all(trainings: list[Training], jobs: int) -> None:
     """Run what is not finished, several at once, with one progress bar over all steps.
 
     Raises:
-        RuntimeError: If a training fails; its log says why.
+        ChildProcessError: If a training fails; its log says why.
     """
     waiting = [training for training in trainings if not training.checkpoint.is_dir()]
     total = sum(training.steps for training in waiting)
@@ -158,7 +158,9 @@ def _train(training: Training) -> None:
             [str(executable), *training.command[1:]], stdout=log, stderr=subprocess.STDOUT, env=one_thread
         )
     if run.returncode != 0:
-        raise RuntimeError(f"training {training.policy} on {training.dataset} failed: see {training.log}")
+        raise ChildProcessError(
+            f"training {training.policy} on {training.dataset} failed: see {training.log}"
+        )
 
 
 def _steps_done(training: Training) -> int:

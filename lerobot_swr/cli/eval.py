@@ -72,7 +72,7 @@ class EvalCommand:
     seed: int = 1000
     # Where results are written; null makes a folder under outputs/swr_eval.
     output_dir: Path | None = None
-    # Rename observations of the environment or dataset to the policy's names.
+    # Rename observations of the environment to the policy's names.
     rename_map: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -120,7 +120,7 @@ def evaluate(cfg: EvalCommand) -> None:
     assert cfg.output_dir is not None
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
     trajectories = load_reference(cfg.dataset, checkpoint)
-    title = f"{cfg.policy.type} on {trajectories.name}"
+    title = f"{cfg.policy.type} on {Path(trajectories.name).name}"
     if cfg.env is None:
         errors = frame_errors(checkpoint, trajectories, cfg.dataset.episodes, cfg.seed)
         offline = summarize(errors)

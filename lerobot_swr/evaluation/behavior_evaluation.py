@@ -72,6 +72,7 @@ def evaluate_behaviors(
     demonstrated: Sequence[str],
     style_sampling: str | None,
     reference_episodes: Sequence[int] | None = None,
+    drawn_episodes: Sequence[int] | None = None,
 ) -> BehaviorResult:
     """Compare rollouts with demonstrations.
 
@@ -81,13 +82,19 @@ def evaluate_behaviors(
             episode of another dataset are left out of the style fidelity.
         style_sampling: How styles were drawn; None for a policy without styles.
         reference_episodes: The episodes that make up the reference histogram; None takes all.
+        drawn_episodes: The episodes whose styles may be drawn, for the floor; None takes the reference's.
     """
     labels = [rollout.behavior for rollout in rollouts]
     successes = [rollout.success for rollout in rollouts]
     chosen = range(len(demonstrated)) if reference_episodes is None else reference_episodes
     reference = [demonstrated[i] for i in chosen]
     reference_histogram = histogram(reference)
-    floor = l1_floor(reference, len(rollouts), stratified=style_sampling in ("stratified", "fixed"))
+    floor = l1_floor(
+        reference,
+        len(rollouts),
+        stratified=style_sampling in ("stratified", "fixed"),
+        drawn_from=None if drawn_episodes is None else [demonstrated[i] for i in drawn_episodes],
+    )
     styled = [r for r in rollouts if r.style_episode is not None and r.style_episode < len(demonstrated)]
     requested = [demonstrated[r.style_episode] for r in styled if r.style_episode is not None]
     return BehaviorResult(
@@ -156,10 +163,14 @@ def compare(
     """
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed)
-    sampling = checkpoint.policy.config.style_sampling if checkpoint.has_styles else None
+    sampling, drawn = None, None
+    if checkpoint.has_styles:
+        sampling = checkpoint.policy.config.style_sampling
+        allowed = checkpoint.policy.styles.allowed().tolist()  # type: ignore[union-attr, operator]
+        drawn = [episode for episode in allowed if episode < len(demonstrated)] or None
     chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
     return Comparison(
-        evaluate_behaviors(rollouts, demonstrated, sampling, reference_episodes),
+        evaluate_behaviors(rollouts, demonstrated, sampling, reference_episodes, drawn),
         [(path_of(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
         [(path_of(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
     )

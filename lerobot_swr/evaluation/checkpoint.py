@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
@@ -41,6 +41,8 @@ class DatasetSource:
             meta = LeRobotDatasetMetadata(self.repo_id or f"local/{self.root.name}", root=self.root)
         else:
             meta = LeRobotDataset(self.repo_id, download_videos=False).meta
+        if self.episodes is not None and not self.episodes:
+            raise ValueError("dataset.episodes=[]: no episode is left to compare with; leave it out for all")
         beyond = [episode for episode in self.episodes or [] if not 0 <= episode < meta.total_episodes]
         if beyond:
             raise ValueError(
@@ -105,8 +107,14 @@ def load_reference(source: DatasetSource, checkpoint: Checkpoint) -> Trajectorie
     """
     meta = source.metadata()
     keys = [key for key, ft in meta.features.items() if _is_low_dimensional(key, ft)]
-    trajectories = load_trajectories(meta, keys)
     config = checkpoint.policy.config
+    needed = [key for key, ft in config.input_features.items() if ft.type is not FeatureType.VISUAL]
+    absent = [key for key in [*needed, OBS_STATE] if key not in keys]
+    if absent:
+        raise ValueError(
+            f"dataset.root={str(meta.root)!r} lacks {absent}, which the policy looks at; it has {keys}"
+        )
+    trajectories = load_trajectories(meta, keys)
     known = getattr(config, "dataset_fingerprint", None)
     if checkpoint.has_styles and known is not None:
         if len(trajectories) != config.num_episodes:

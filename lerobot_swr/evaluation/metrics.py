@@ -59,7 +59,13 @@ def l1_distance(p: Mapping[str, float], q: Mapping[str, float]) -> float:
     return float(sum(abs(p.get(label, 0.0) - q.get(label, 0.0)) for label in p.keys() | q.keys()))
 
 
-def l1_floor(reference: Sequence[str], n_episodes: int, stratified: bool = False, seed: int = 0) -> Floor:
+def l1_floor(
+    reference: Sequence[str],
+    n_episodes: int,
+    stratified: bool = False,
+    drawn_from: Sequence[str] | None = None,
+    seed: int = 0,
+) -> Floor:
     """L1 of a perfect reproducer that shows the behaviour of a drawn demonstration in every rollout.
 
     Source: simulation of the two ways of drawing demonstrations; the uniform one is a multinomial sample of
@@ -68,18 +74,20 @@ def l1_floor(reference: Sequence[str], n_episodes: int, stratified: bool = False
     Args:
         reference: One label per demonstration.
         n_episodes: Number of rollouts.
+        drawn_from: The labels of the demonstrations that are drawn; None draws those of the reference.
         stratified: Draw every demonstration once before any is drawn again; otherwise with replacement.
         seed: Seed of the simulation.
     """
-    counts = np.array(list(Counter(reference).values()))
-    share = counts / counts.sum()
+    names = sorted({*reference, *(drawn_from or ())})
+    goal = np.array([reference.count(name) for name in names]) / len(reference)
+    counts = np.array([(drawn_from or reference).count(name) for name in names])
     rng = np.random.default_rng(seed)
     if stratified:
         rounds, rest = divmod(n_episodes, int(counts.sum()))
         drawn = rounds * counts + rng.multivariate_hypergeometric(counts, rest, size=FLOOR_DRAWS)
     else:
-        drawn = rng.multinomial(n_episodes, share, size=FLOOR_DRAWS)  # (draws, labels)
-    distances = np.abs(drawn / n_episodes - share).sum(axis=1)
+        drawn = rng.multinomial(n_episodes, counts / counts.sum(), size=FLOOR_DRAWS)  # (draws, labels)
+    distances = np.abs(drawn / n_episodes - goal).sum(axis=1)
     return Floor(float(distances.mean()), Interval(*np.quantile(distances, [0.025, 0.975]).tolist()))
 
 

@@ -81,10 +81,19 @@ def frame_errors(
     chosen = np.arange(len(trajectories)) if episodes is None else np.array(episodes)
     styles: dict[str, np.ndarray | None] = {"none": None}
     if isinstance(policy, ZBCPolicy):
-        trained = policy.styles.trained.bool().cpu().numpy()
+        # Styles added for episodes of other datasets follow those of the training dataset.
+        trained = policy.styles.trained.bool().cpu().numpy()[: len(trajectories)]
+        if trained.sum() < 2:
+            raise ValueError(
+                f"the checkpoint has {trained.sum()} trained style(s); offline evaluation compares an "
+                "episode's own style with another one and needs at least 2"
+            )
         chosen = chosen[trained[chosen]]
-        if trained.sum() < 2 or len(chosen) == 0:
-            raise ValueError("offline evaluation compares styles: at least 2 trained episodes are needed")
+        if len(chosen) == 0:
+            raise ValueError(
+                f"dataset.episodes={episodes}: none of them was trained on, so none has a style; "
+                f"trained were {np.flatnonzero(trained).tolist()}"
+            )
     frames = np.concatenate(
         [trajectories.starts[i] + np.arange(trajectories.lengths[i]) for i in chosen]
     )  # (F,) rows
@@ -101,7 +110,7 @@ def _styles_of_frames(
     policy: ZBCPolicy, trajectories: Trajectories, trained: np.ndarray, own: np.ndarray, seed: int
 ) -> dict[str, np.ndarray | None]:
     """Kind of style to the (F,) episodes whose styles the frames use."""
-    distances = pairwise_distances(trajectories.states(policy.config.observation_keys))
+    distances = pairwise_distances(trajectories.states(policy.compared_keys()))
     np.fill_diagonal(distances, np.inf)
     nearest = trained[distances[:, trained].argmin(axis=1)]  # (N,)
     place = np.searchsorted(trained, own)

@@ -128,7 +128,7 @@ class BCConfig(PreTrainedConfig):
         if self.robot_state_feature is None:
             raise ValueError(
                 f"policy {self.type!r} needs the feature {OBS_STATE!r}; the dataset has: "
-                f"{', '.join(self.input_features or {})} (rename a feature with --rename_map)"
+                f"{', '.join(self.input_features or {})} (rename the feature in the dataset)"
             )
         if self.action_feature is None:
             raise ValueError(f"policy {self.type!r} needs the feature 'action'; the dataset has none")
@@ -217,7 +217,7 @@ class WZBCConfig(ZBCConfig):
     # Inverse temperature of the weights exp(-beta * nu): 0 lets every demonstration teach every style, large
     # values only (near-)equal ones.
     beta: float = 10.0
-    # Probability of relabelling a frame with another demonstration's style; 0 is ZBC.
+    # Probability with which algorithm 1 relabels a frame with another demonstration's style; 0 is ZBC.
     p: float = 0.8
     # Draw pairs by their share in the expected loss ("weighted"), or partners uniformly with the loss
     # weighted ("uniform", the paper: same expectation, but a share p of the batch teaches almost nothing).

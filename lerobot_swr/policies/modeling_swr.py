@@ -108,7 +108,7 @@ class BCPolicy(PreTrainedPolicy):
         fingerprint = self._trajectories.fingerprint([OBS_STATE])
         known = config.dataset_fingerprint
         self._new_dataset = known is not None and known != fingerprint
-        if self._new_dataset and parser.parse_arg("resume") in ("true", "True", "1"):
+        if self._new_dataset and parser.parse_arg("resume") in ("true", "True", "yes", "1"):
             raise ValueError(
                 f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
                 f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
@@ -469,8 +469,10 @@ class WZBCPolicy(ZBCPolicy):
         the mean of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates,
         whichever way pairs are drawn, and defined for every batch: read their averages over time.
         """
-        if not self.training or self.sampler is None:
+        if not self.training:
             return super().frame_losses(batch)
+        if self.sampler is None:
+            raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
         episodes = batch["episode_index"]
         self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
