@@ -4,7 +4,7 @@ import hashlib
 import logging
 import os
 import stat
-import tempfile
+import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -192,9 +192,9 @@ def _write_cache(path: Path, distances: np.ndarray) -> None:
     content = save({"distances": distances}, metadata={"sha256": _checksum(distances)})
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=path.name, delete=False) as file:
-            file.write(content)
-        os.replace(file.name, path)
+        temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}")
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
     except OSError as error:
         logger.warning("Similarity cache %s cannot be written (%s): going on without it.", path, error)
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -187,9 +186,9 @@ def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:
     """Write a result dataclass and where it comes from, all or nothing."""
     content = json.dumps({**asdict(result), "provenance": provenance}, indent=2)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=path.name, delete=False) as file:
-        file.write(content + "\n")
-    os.replace(file.name, path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(content + "\n")
+    os.replace(temporary, path)
 
 
 def format_result(result: BehaviorResult) -> str:
