@@ -1,0 +1,46 @@
+"""What a reader opens exists, and what a user copies parses."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+from lerobot.configs.train import TrainPipelineConfig
+
+REPOSITORY = Path(__file__).parent.parent
+PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_pictures_of_a_page_exist(page):
+    """Every relative link leads to a file of the repository."""
+    targets = re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text())
+    missing = [target for target in targets if "://" not in target and not (page.parent / target).exists()]
+    assert not missing
+
+
+def test_the_readme_is_short():
+    """A stranger reads it to the end."""
+    assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 150
+
+
+@pytest.mark.parametrize("config", CONFIGS, ids=lambda config: config.stem)
+def test_a_recipe_is_understood_whole(config):
+    """LeRobot's parser takes every key, and the run would keep its last step."""
+    parsed = TrainPipelineConfig.from_pretrained(config)
+    written = yaml.safe_load(config.read_text())
+    assert parsed.policy is not None
+    for key, value in written["policy"].items():
+        if key not in ("type", "normalization_mapping"):
+            read = getattr(parsed.policy, key)
+            assert (list(read) if isinstance(read, tuple) else read) == value, key
+    assert parsed.steps % parsed.save_freq == 0
+
+
+def test_the_papers_recipe_and_flags_are_the_same_policy():
+    """configs/wzbc_paper.yaml and the flags of docs/method.md."""
+    policy = yaml.safe_load((REPOSITORY / "configs" / "wzbc_paper.yaml").read_text())["policy"]
+    flags = dict(re.findall(r"--policy\.(\w+)=(\S+)", (REPOSITORY / "docs" / "method.md").read_text()))
+    for key in ("residual", "lr_schedule", "style_init_scale", "partner_sampling"):
+        assert str(policy[key]).lower() == flags[key], key
