@@ -22,8 +22,9 @@ def write_dataset(
     """Write a dataset into `root`.
 
     The dataset is built in a hidden work folder beside `root` and moved there when it is complete, so that an
-    interrupted run leaves nothing half-written and an overwritten dataset is replaced at once. Where the
-    recipe keeps finished episodes in the work folder, the next run with the same seed continues from them.
+    interrupted run leaves nothing half-written and an old dataset is removed only when the new one is
+    complete. Where the recipe keeps finished episodes in the work folder, the next run with the same seed
+    continues from them.
 
     Args:
         recipe: What to write.

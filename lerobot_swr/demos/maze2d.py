@@ -13,7 +13,7 @@ from scipy.interpolate import PchipInterpolator
 
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
-from lerobot_swr.envs.maze2d.dynamics import MAX_STEP
+from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal
 from lerobot_swr.envs.maze2d.env import FPS, INSTRUCTION, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, get_layout
 
@@ -96,7 +96,7 @@ def walk(path: np.ndarray, speed: float, task: str, rng: np.random.Generator) ->
 
         states.append(agents.observe(position))
         actions.append(action)
-        frames_at_goal += bool(np.linalg.norm(position[0] - agents.layout.goal) <= agents.layout.goal_radius)
+        frames_at_goal += bool(in_goal(position, agents.layout)[0])
         if frames_at_goal == FRAMES_AT_GOAL:
             observations = {
                 "observation.state": np.concatenate([state["agent_pos"] for state in states]),

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from lerobot_swr.envs.maze2d.dynamics import in_goal
 from lerobot_swr.envs.maze2d.layouts import LAYOUTS, MazeLayout
 
 
@@ -22,9 +23,9 @@ def checkpoints_passed(positions: np.ndarray, layout: MazeLayout) -> str:
         nothing at all is ``""``.
     """
     positions = np.asarray(positions, dtype=np.float64)
-    in_goal = np.linalg.norm(positions - np.array(layout.goal), axis=1) <= layout.goal_radius  # (T,)
-    reaches_goal = bool(in_goal.any())
-    end = int(in_goal.argmax()) + 1 if reaches_goal else len(positions)
+    at_goal = in_goal(positions, layout)  # (T,)
+    reaches_goal = bool(at_goal.any())
+    end = int(at_goal.argmax()) + 1 if reaches_goal else len(positions)
 
     y = positions[:end, 1]
     above = y[:, None] > layout.wall_y[None, :]  # (T, W)
