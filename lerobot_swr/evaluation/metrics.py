@@ -65,6 +65,7 @@ def l1_floor(
     stratified: bool = False,
     drawn_from: Sequence[str] | None = None,
     seed: int = 0,
+    n_averaged: int = 1,
 ) -> Floor:
     """L1 of a perfect reproducer that shows the behaviour of a drawn demonstration in every rollout.
 
@@ -77,17 +78,19 @@ def l1_floor(
         drawn_from: The labels of the demonstrations that are drawn; None draws those of the reference.
         stratified: Draw every demonstration once before any is drawn again; otherwise with replacement.
         seed: Seed of the simulation.
+        n_averaged: The score is the mean of this many independent evaluations, which narrows the band.
     """
     names = sorted({*reference, *(drawn_from or ())})
     goal = np.array([reference.count(name) for name in names]) / len(reference)
     counts = np.array([(drawn_from or reference).count(name) for name in names])
     rng = np.random.default_rng(seed)
+    shape = (FLOOR_DRAWS, n_averaged)
     if stratified:
         rounds, rest = divmod(n_episodes, int(counts.sum()))
-        drawn = rounds * counts + rng.multivariate_hypergeometric(counts, rest, size=FLOOR_DRAWS)
+        drawn = rounds * counts + rng.multivariate_hypergeometric(counts, rest, size=shape)
     else:
-        drawn = rng.multinomial(n_episodes, counts / counts.sum(), size=FLOOR_DRAWS)  # (draws, labels)
-    distances = np.abs(drawn / n_episodes - goal).sum(axis=1)
+        drawn = rng.multinomial(n_episodes, counts / counts.sum(), size=shape)  # (draws, averaged, labels)
+    distances = np.abs(drawn / n_episodes - goal).sum(axis=2).mean(axis=1)
     return Floor(float(distances.mean()), Interval(*np.quantile(distances, [0.025, 0.975]).tolist()))
 
 

@@ -14,6 +14,7 @@ from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.metrics import Histogram
 
 MAX_BARS = 24
+PANELS_IN_A_ROW = 4
 DEMONSTRATIONS, ROLLOUTS = "0.6", "tab:blue"
 
 Paths = Sequence[tuple[np.ndarray, str]]
@@ -61,7 +62,7 @@ def plot_behaviors(
 def plot_comparison(
     path: Path, demonstrations: Paths, policies: Mapping[str, Paths], env_cfg: EnvConfig, title: str
 ) -> None:
-    """Demonstrations beside the rollouts of several policies, in one row.
+    """Demonstrations beside the rollouts of several policies, at most four panels in a row.
 
     Args:
         path: Where to write the picture.
@@ -71,11 +72,16 @@ def plot_comparison(
         title: Heading of the picture.
     """
     panels = {"demonstrations": demonstrations, **policies}
-    figure = Figure(figsize=(3.3 * len(panels), 3.9), layout="constrained")
+    columns = min(len(panels), PANELS_IN_A_ROW)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(3.3 * columns, 3.9 * rows), layout="constrained")
     colors = behavior_colors([label for paths in panels.values() for _, label in paths])
-    for axes, (name, paths) in zip(figure.subplots(1, len(panels)), panels.items(), strict=True):
+    grid = figure.subplots(rows, columns, squeeze=False).flat
+    for axes, (name, paths) in zip(grid, panels.items(), strict=False):
         draw_paths(axes, paths, colors, env_cfg)
         axes.set_title(name)
+    for axes in grid:  # those that are left over
+        axes.set_axis_off()
     figure.suptitle(title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

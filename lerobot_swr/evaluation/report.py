@@ -30,6 +30,9 @@ TEMPLATE = """<!doctype html>
 <p>{{ introduction }}</p>
 {% for section in sections %}
 <h2>{{ section.title }}</h2>
+{% for paragraph in section.text %}
+<p>{{ paragraph }}</p>
+{% endfor %}
 {% for table in section.tables %}
 <div class="scroll"><table>
 <caption>{{ table.caption }}</caption>
@@ -76,11 +79,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, then tables, then pictures."""
+    """A heading, then paragraphs, then tables, then pictures."""
 
     title: str
     tables: Sequence[Table]
     figures: Sequence[Picture]
+    text: Sequence[str] = ()
 
 
 def write_report(

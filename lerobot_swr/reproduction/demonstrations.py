@@ -1,0 +1,118 @@
+"""The datasets of the experiments: made where absent, and described for everything that comes after."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from lerobot.envs import EnvConfig
+from lerobot.utils.constants import ACTION
+
+from lerobot_swr.behaviors import DATASET_RULES
+from lerobot_swr.demos.catalog import RECIPES, get_recipe
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.evaluation.checkpoint import DatasetSource
+from lerobot_swr.evaluation.length_control import frames_after_end
+from lerobot_swr.reproduction.cells import Cell, Labels, Store
+from lerobot_swr.trajectories import Trajectories, load_trajectories
+
+PATH_POINTS = 40  # of a stored path
+MAX_PATHS = 100  # stored per dataset
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """A dataset of the experiments.
+
+    Attributes:
+        name: Its name.
+        root: Its folder.
+        fingerprint: Hash of its observations and actions.
+        env: Options of its environment, ``type`` and ``task`` among them.
+        count: Number of demonstrations.
+    """
+
+    name: str
+    root: Path
+    fingerprint: str
+    env: dict[str, Any]
+    count: int
+
+    @property
+    def cell(self) -> Cell:
+        """The cell that holds the dataset's description."""
+        return Cell("dataset", Labels(self.name, "", ""), {"fingerprint": self.fingerprint, "env": self.env})
+
+
+def prepare(name: str, folder: Path, store: Store) -> Demonstrations:
+    """Find or make a dataset, and store its description.
+
+    Args:
+        name: Name of the dataset.
+        folder: Where datasets lie.
+        store: Where the description goes.
+
+    Raises:
+        ValueError: If there is no such dataset, or its environment is not one of this package's.
+    """
+    root = folder / name
+    if not (root / "meta" / "info.json").is_file():
+        if name not in RECIPES:
+            raise ValueError(
+                f"datasets: {name!r} is neither in {folder} nor one of the package's: {', '.join(RECIPES)}"
+            )
+        print(f"making {name} in {root}", flush=True)
+        write_dataset(get_recipe(name), root, seed=0)
+    meta = DatasetSource(root=root).metadata()
+    if meta.robot_type not in DATASET_RULES:
+        raise ValueError(
+            f"datasets: {name!r} has robot_type={meta.robot_type!r}; the experiments need an environment, "
+            f"which this package has for {', '.join(DATASET_RULES)}"
+        )
+    trajectories = load_low_dimensional(root)
+    env_type, task = meta.robot_type.split("_", 1)
+    fingerprint = trajectories.fingerprint(sorted(trajectories.columns))
+    demonstrations = Demonstrations(
+        name, root, fingerprint, {"type": env_type, "task": task}, len(trajectories)
+    )
+    if not store.is_done(demonstrations.cell):
+        store.write(demonstrations.cell, _describe(trajectories, environment(demonstrations.env)), 0.0)
+    return demonstrations
+
+
+def load_low_dimensional(root: Path) -> Trajectories:
+    """All observations and actions of a dataset of this package."""
+    meta = DatasetSource(root=root).metadata()
+    return load_trajectories(
+        meta, [key for key in meta.features if key.startswith("observation.")] + [ACTION]
+    )
+
+
+def environment(options: dict[str, Any]) -> TaskEnvConfig:
+    """The environment's configuration from its options."""
+    options = dict(options)
+    config = EnvConfig.get_choice_class(options.pop("type"))(**options)
+    assert isinstance(config, TaskEnvConfig)
+    return config
+
+
+def short_path(path: np.ndarray) -> list[list[float]]:
+    """At most `PATH_POINTS` points of a (T, 2) path, rounded, for pictures."""
+    chosen = np.linspace(0, len(path) - 1, min(len(path), PATH_POINTS)).round().astype(int)
+    return np.round(path[chosen].astype(float), 3).tolist()
+
+
+def _describe(trajectories: Trajectories, env_cfg: TaskEnvConfig) -> dict[str, Any]:
+    rule = env_cfg.behavior_rule()
+    stride = -(-len(trajectories) // MAX_PATHS)
+    return {
+        "behavior": [rule(episode) for episode in trajectories.episodes()],
+        "length": trajectories.lengths.tolist(),
+        "frames_after_end": frames_after_end(trajectories, env_cfg),
+        "path_episodes": list(range(0, len(trajectories), stride)),
+        "paths": [
+            short_path(path_of(env_cfg, trajectories.episode(i))) for i in range(0, len(trajectories), stride)
+        ],
+    }

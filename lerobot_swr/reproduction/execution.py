@@ -1,0 +1,232 @@
+"""Runs cells: what is missing, in parallel, each to its end or to a logged failure."""
+
+import contextlib
+import json
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed
+from tqdm import tqdm
+
+from lerobot_swr.reproduction.cells import Cell, Store, write_text
+from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
+from lerobot_swr.reproduction.measurement import measure
+from lerobot_swr.reproduction.settings import ReproductionSettings
+from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
+from lerobot_swr.reproduction.suites import DATASETS, known_policies, suite_cells
+from lerobot_swr.reproduction.training import checkpoint_folder, steps_done, train
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A cell that ended with an error.
+
+    Attributes:
+        cell: The cell.
+        message: The error.
+        log: Where the rest is.
+    """
+
+    cell: Cell
+    message: str
+    log: Path
+
+
+def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure]:
+    """Run the chosen suites: every cell that is not finished, and no other.
+
+    Runs under joblib's active backend, so ``with joblib.parallel_config(backend=...)`` sends the cells to a
+    cluster whose machines see the same output folder.
+
+    Args:
+        settings: What to run.
+        command: What the user typed, for the report.
+
+    Returns:
+        The cells that failed.
+
+    Raises:
+        ValueError: If a dataset or policy is unknown, or nothing is left to run.
+    """
+    _check_policies(settings)
+    store = Store(settings.output_dir)
+    suites = {name: settings.choose_datasets(DATASETS[name]) for name in settings.suites}
+    names = dict.fromkeys(name for datasets in suites.values() for name in datasets)
+    prepared = {name: prepare(name, settings.dataset_folder, store) for name in names}
+    cells: dict[Cell, None] = {}
+    for suite, datasets in suites.items():
+        of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])
+        if of_suite:
+            _write_manifest(store, suite, settings, command, of_suite, [prepared[name] for name in datasets])
+        cells.update(dict.fromkeys(of_suite))
+    if not cells:
+        raise ValueError(f"datasets={settings.datasets}, policies={settings.policies}: nothing to run")
+    if settings.dry_run:
+        print(format_states(list(cells), store))
+        return []
+    failures = run_cells(list(cells), store, prepared, settings.jobs)
+    print(format_states(list(cells), store))
+    return failures
+
+
+def run_cells(
+    cells: Sequence[Cell], store: Store, datasets: Mapping[str, Demonstrations], jobs: int | None
+) -> list[Failure]:
+    """Compute the cells that are not finished.
+
+    A training and everything measured on it form a chain, which one worker goes through; chains run in
+    parallel.
+
+    Args:
+        cells: The cells, in any order.
+        store: Where results go.
+        datasets: The datasets by name.
+        jobs: Workers; None takes joblib's active configuration.
+    """
+    chains = unfinished_chains(cells, store)
+    workers = {} if jobs is None else {"n_jobs": jobs}
+    roots = {name: demos.root.resolve() for name, demos in datasets.items()}
+    with _progress([cell for chain in chains for cell in chain], store):
+        outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chains)
+    return [failure for failures in outcomes for failure in failures]
+
+
+def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
+    """What is left to compute: each chain is a training and what depends on it, or a cell on its own.
+
+    A training whose dependants are all finished is not asked for again; one whose checkpoints are gone is,
+    if something still depends on it. Long trainings come first.
+    """
+    chains: list[list[Cell]] = []
+    for root in dict.fromkeys(cell.needs or cell for cell in cells):
+        waiting = [cell for cell in cells if cell.needs == root and not store.is_done(cell)]
+        wanted = bool(waiting) if root.kind == "train" else True
+        if wanted and not _is_finished(root, store):
+            waiting.insert(0, root)
+        if waiting:
+            chains.append(waiting)
+
+    def work(chain: list[Cell]) -> int:
+        root = chain[0]
+        return root.definition["steps"] * len(root.definition["seeds"]) if root.kind == "train" else 0
+
+    return sorted(chains, key=work, reverse=True)
+
+
+def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path]) -> list[Failure]:
+    """Compute the cells of a chain one after the other, up to the first training that fails."""
+    failures = []
+    for cell in chain:
+        failure = _run_cell(cell, store, datasets[cell.labels.dataset])
+        if failure is not None:
+            failures.append(failure)
+            if cell.kind == "train":
+                break
+    return failures
+
+
+def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
+    with store.lock(cell) as lock:
+        if _is_finished(cell, store):  # by another command meanwhile
+            return None
+        store.failure_path(cell).unlink(missing_ok=True)
+        start = time.monotonic()
+        try:
+            with store.log_path(cell).open("a") as log, contextlib.redirect_stderr(log):
+                result = _compute(cell, store, dataset, lock)
+        except Exception as error:
+            with store.log_path(cell).open("a") as log:
+                traceback.print_exc(file=log)
+            message = f"{type(error).__name__}: {error}"
+            write_text(store.failure_path(cell), message + "\n")
+            return Failure(cell, message, store.log_path(cell))
+        store.write(cell, result, time.monotonic() - start)
+        return None
+
+
+def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:
+    if cell.kind == "train":
+        return train(cell, store, dataset, lock)
+    if cell.kind == "evaluate":
+        return measure(cell, store, dataset)
+    if cell.kind == "styles":
+        return compute_style_map(cell, store, dataset)
+    return compute_similarity(cell, dataset)
+
+
+def format_states(cells: Sequence[Cell], store: Store) -> str:
+    """A table for the terminal: what is done, failed or waiting."""
+    rows = [(store.state(cell), str(cell.labels)) for cell in cells]
+    counts = {state: sum(s == state for s, _ in rows) for state in ("done", "failed", "waiting")}
+    lines = [f"{state:<8} {name}" for state, name in rows]
+    return "\n".join([*lines, ", ".join(f"{count} {state}" for state, count in counts.items())])
+
+
+def _is_finished(cell: Cell, store: Store) -> bool:
+    """Whether the result and, of a training, its checkpoints are there."""
+    if cell.kind != "train":
+        return store.is_done(cell)
+    folders = [checkpoint_folder(cell, store, seed) for seed in cell.definition["seeds"]]
+    return store.is_done(cell) and all(folder.is_dir() for folder in folders)
+
+
+def _check_policies(settings: ReproductionSettings) -> None:
+    unknown = [name for name in settings.policies or [] if name not in known_policies()]
+    if unknown:
+        raise ValueError(
+            f"policies={unknown}: unknown; this installation knows {', '.join(known_policies())}"
+        )
+
+
+def _write_manifest(
+    store: Store,
+    suite: str,
+    settings: ReproductionSettings,
+    command: str,
+    cells: Sequence[Cell],
+    datasets: Sequence[Demonstrations],
+) -> None:
+    """What the report of a suite consists of: the last run decides."""
+    content = {
+        "suite": suite,
+        "command": command,
+        "settings": {key: str(v) if isinstance(v, Path) else v for key, v in asdict(settings).items()},
+        "datasets": {demos.name: store.result_path(demos.cell).name for demos in datasets},
+        "cells": [store.result_path(cell).name for cell in cells],
+    }
+    write_text(store.root / "suites" / f"{suite}.json", json.dumps(content, indent=1) + "\n")
+
+
+@contextlib.contextmanager
+def _progress(cells: Sequence[Cell], store: Store) -> Iterator[None]:
+    """A bar over the cells, fed from what they have written, whoever computes them."""
+    finished = threading.Event()
+    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout, mininterval=0) as bar:
+
+        def watch() -> None:
+            while True:
+                last = finished.wait(2.0)
+                done = sum(_share_done(cell, store) for cell in cells)
+                bar.update(round(done, 2) - bar.n)
+                if last:
+                    return
+
+        watcher = threading.Thread(target=watch, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            finished.set()
+            watcher.join()
+
+
+def _share_done(cell: Cell, store: Store) -> float:
+    if store.is_done(cell):
+        return 1.0
+    return steps_done(cell, store) if cell.kind == "train" else 0.0

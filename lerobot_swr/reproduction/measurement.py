@@ -1,0 +1,92 @@
+"""Computes an evaluation cell: rollouts of every training seed, by each way of drawing styles."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lerobot.configs import PreTrainedConfig
+
+from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.reproduction.cells import Cell, Store, write_text
+from lerobot_swr.reproduction.demonstrations import environment, short_path
+from lerobot_swr.reproduction.training import checkpoint_folder
+
+BATCH_SIZE = 100  # environments that run at once
+
+
+def measure(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]:
+    """Roll out every seed of the cell's training.
+
+    The rollouts of each seed and way of drawing are kept as soon as they are made, so that an interrupted
+    cell goes on with the next ones.
+
+    Args:
+        cell: An evaluation cell.
+        store: Where the checkpoints are, and the parts go.
+        dataset: Folder of the dataset.
+
+    Returns:
+        The result: ``rollouts[seed][protocol]`` with one list per figure, ``allowed`` (the episodes whose
+        styles could be drawn; None: all or no styles) and ``paths`` of the first seed's last rollouts.
+    """
+    assert cell.needs is not None
+    result: dict[str, Any] = {"rollouts": {}, "allowed": None, "paths": []}
+    for seed in cell.needs.definition["seeds"]:
+        result["rollouts"][str(seed)] = {}
+        for protocol in cell.definition["protocols"]:
+            path = store.work_folder(cell) / "parts" / f"seed_{seed}-{protocol}.json"
+            if not path.is_file():
+                write_text(path, json.dumps(_part(cell, store, dataset, seed, protocol)))
+            part = json.loads(path.read_text())
+            result["rollouts"][str(seed)][protocol] = part["rollouts"]
+            result["allowed"] = part["allowed"]
+            if seed == cell.needs.definition["seeds"][0]:
+                result["paths"] = part["paths"]
+    return result
+
+
+def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> dict[str, Any]:
+    assert cell.needs is not None
+    definition = cell.definition
+    checkpoint = load_policy(checkpoint_folder(cell.needs, store, seed), protocol, definition["style_filter"])
+    load_reference(DatasetSource(root=dataset), checkpoint)  # refuses another dataset than the training's
+    env_cfg = environment(definition["env"])
+    count = definition["protocols"][protocol]
+    # Rollout k of a training seed meets the same start and noise whatever the policy.
+    env_seed = definition["seed"] * (seed + 1)
+    rollouts = run_rollouts(checkpoint, env_cfg, env_cfg.behavior_rule(), count, BATCH_SIZE, env_seed)
+    filtered = definition["style_filter"] is not None
+    return {
+        "rollouts": _columns(rollouts),
+        "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
+        "paths": [short_path(path_of(env_cfg, r.observations)) for r in rollouts]
+        if definition["paths"]
+        else [],
+    }
+
+
+def load_policy(folder: Path, style_sampling: str | None, style_filter: str | None) -> Checkpoint:
+    """A checkpoint that draws its styles in the given way, if it has styles.
+
+    Args:
+        folder: Its ``pretrained_model``.
+        style_sampling: ``uniform`` or ``stratified``; None keeps the checkpoint's.
+        style_filter: Only styles of demonstrations that match; None allows all.
+    """
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    if hasattr(config, "style_sampling"):
+        config.style_sampling = style_sampling or config.style_sampling
+        config.style_filter = style_filter  # type: ignore[attr-defined]
+    return load_checkpoint(config)
+
+
+def _columns(rollouts: list[Rollout]) -> dict[str, list]:
+    return {
+        "behavior": [rollout.behavior for rollout in rollouts],
+        "success": [int(rollout.success) for rollout in rollouts],
+        "length": [rollout.length for rollout in rollouts],
+        "style": [rollout.style_episode for rollout in rollouts],
+    }

@@ -1,0 +1,215 @@
+"""The report: a results section drawn from the stored cells, without computing any of them again."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from lerobot_swr.evaluation.report import Picture, Section, write_report
+from lerobot_swr.reproduction import figures, tables
+from lerobot_swr.reproduction.cells import write_text
+from lerobot_swr.reproduction.paper import SOURCE
+from lerobot_swr.reproduction.stored_results import SuiteResults, load_suites
+
+INTRODUCTION = (
+    f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
+    "demonstrators and the sizes of the perturbations are this package's own, so the paper's numbers beside "
+    "ours tell the order of magnitude and nothing more; a dash stands where none could be checked. L1 is the "
+    "distance of the behaviour histograms of rollouts and demonstrations, 0 (equal) to 2 (disjoint); a failed "
+    "rollout is a behaviour of its own. Drawing styles uniformly (the paper's protocol), even a perfect "
+    "reproducer scores the floor; with each style used once (stratified) its L1 is 0."
+)
+
+
+def write_results_report(root: Path) -> Path:
+    """Write ``report.html``, its pictures and ``summaries.json`` from the stored results.
+
+    Args:
+        root: Folder with ``suites/`` and ``results/``.
+
+    Returns:
+        The HTML file.
+
+    Raises:
+        FileNotFoundError: If the folder has no results.
+    """
+    suites = load_suites(root)
+    pictures = root / "figures"
+    build = {"table1": _diversity, "robustness": _robustness, "control": _control, "figures": _figures}
+    sections = [
+        section
+        for name, make in build.items()
+        if name in suites
+        for section in (*make(suites[name], pictures), *_missing(suites[name]))
+    ]
+    write_text(root / "summaries.json", json.dumps(_summaries(suites), indent=1) + "\n")
+    report = root / "report.html"
+    commands = [suite.command for suite in suites.values() if suite.command]
+    write_report(
+        report,
+        "Reproducing and controlling the diversity of demonstrations",
+        INTRODUCTION,
+        sections,
+        [*dict.fromkeys(commands), f"lerobot-swr-report {root}"],
+        _versions(suites),
+    )
+    return report
+
+
+def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name, demonstrations in suite.datasets.items():
+        cells = suite.evaluations(name)
+        if not cells:
+            continue
+        paths, histograms = pictures / f"paths-{name}.png", pictures / f"histograms-{name}.png"
+        figures.plot_paths(paths, demonstrations, cells)
+        figures.plot_histograms(histograms, demonstrations, cells)
+        yield Section(
+            f"Diversity: {name}",
+            [tables.table1(suite, name)],
+            [
+                Picture(
+                    "Paths coloured by behaviour: demonstrations, and the rollouts of each policy's first "
+                    "training seed (each style once, where the policy has styles).",
+                    paths,
+                ),
+                Picture(
+                    "Behaviour histograms: demonstrations, and all seeds' rollouts of each policy (each style "
+                    "once, where it has styles).",
+                    histograms,
+                ),
+            ],
+            _baseline_note(suite, name),
+        )
+
+
+def _baseline_note(suite: SuiteResults, dataset: str) -> list[str]:
+    others = [c for c in suite.evaluations(dataset) if c.labels.policy not in ("bc", "zbc", "wzbc")]
+    if not others:
+        return []
+    names = ", ".join(c.labels.policy for c in others)
+    return [
+        f"{names}: small networks that a CPU trains, and fewer steps and seeds than ours (see the table). They "
+        "show how other kinds of policy behave on these data, not what they could reach."
+    ]
+
+
+def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name in suite.datasets:
+        cells = suite.evaluations(name)
+        if not cells:
+            continue
+        curves = pictures / f"robustness-{name}.png"
+        figures.plot_perturbations(curves, cells)
+        why = [tables.teaching(cell) for cell in suite.of_kind("similarity", name)]
+        yield Section(
+            f"Robustness: {name}",
+            [tables.robustness(suite, name), tables.robustness_differences(suite, name), *why],
+            [
+                Picture(
+                    "Success, style match and L1 over the half-width of the square of starts (top) and the "
+                    "noise on every step (bottom), each style once; shaded: 95 % intervals as in the table. "
+                    f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
+                    curves,
+                )
+            ],
+            [
+                "WZBC can differ from ZBC only as far as other demonstrations teach a style. The last table "
+                "says how far that is: with the paper's β and p, a style's own demonstration carries most of "
+                "its weight here."
+            ],
+        )
+
+
+def _control(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name, demonstrations in suite.datasets.items():
+        cells = suite.evaluations(name)
+        drawn = []
+        if any(cell.labels.condition == "controlled" for cell in cells):
+            picture = pictures / f"control-{name}.png"
+            figures.plot_control(picture, demonstrations, cells)
+            drawn.append(
+                Picture(
+                    "Lengths of all demonstrations, of those in the band (green), of free and of controlled "
+                    "rollouts of all seeds; right: L1 to the demonstrations in the band, mean (bar) and each "
+                    "seed (dots).",
+                    picture,
+                )
+            )
+        if cells:
+            yield Section(f"Control: {name}", [tables.control(suite, name)], drawn)
+
+
+def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name, demonstrations in suite.datasets.items():
+        drawn, shown = [], []
+        for cell in suite.of_kind("similarity", name):
+            nu, rho = pictures / f"dissimilarity-{name}.png", pictures / f"input_distribution-{name}.png"
+            figures.plot_dissimilarity(nu, demonstrations, cell)
+            figures.plot_input_distributions(rho, demonstrations, cell)
+            drawn += [
+                Picture("Dissimilarity ν of all demonstrations to a reference demonstration (red).", nu),
+                Picture(
+                    "ρ(s̃ | z), eq. 3: which states teach the style of the first of these references, on a "
+                    "grid, for several β; colours on a square-root scale up to each panel's maximum.",
+                    rho,
+                ),
+            ]
+            shown.append(tables.teaching(cell))
+        maps = suite.of_kind("styles", name)
+        if maps:
+            picture = pictures / f"styles-{name}.png"
+            figures.plot_style_maps(picture, demonstrations, maps)
+            seeds = len(maps[0].result["neighbour_agreement"])
+            drawn.append(
+                Picture(
+                    "Styles of the first training seed by behaviour, in the plane of their two main "
+                    f"directions. Titles: share of styles whose nearest other style belongs to a "
+                    f"demonstration of the same behaviour, mean over {seeds} seeds.",
+                    picture,
+                )
+            )
+        swept = suite.evaluations(name)
+        if swept:
+            picture = pictures / f"sweep-{name}.png"
+            figures.plot_sweep(picture, swept)
+            drawn.append(Picture("Effect of β and p on WZBC; figures and intervals in the table.", picture))
+            shown.append(tables.sweep(swept))
+        yield Section(f"Similarity and styles: {name}", shown, drawn)
+
+
+def _missing(suite: SuiteResults) -> Iterator[Section]:
+    if suite.missing:
+        text = f"{len(suite.missing)} cells of this suite are not finished: {', '.join(suite.missing)}."
+        yield Section(f"Not finished: {suite.name}", [], [], [text])
+
+
+def _summaries(suites: dict[str, SuiteResults]) -> list[dict[str, Any]]:
+    """The figures of every evaluation, for other programs."""
+    rows = {}
+    for suite in suites.values():
+        for cell in suite.cells:
+            if cell.kind == "evaluate":
+                for protocol, summary in cell.summaries.items():
+                    numbers = asdict(summary)
+                    del numbers["outcomes"]
+                    labels, training = asdict(cell.labels), cell.training
+                    rows[cell.key, protocol] = {**labels, "training": training, **numbers}
+    return list(rows.values())
+
+
+def _versions(suites: dict[str, SuiteResults]) -> str:
+    cells = {cell.key: cell for suite in suites.values() for cell in suite.cells}
+    versions = dict.fromkeys(
+        f"{name} {number}" for c in cells.values() for name, number in c.provenance["versions"].items()
+    )
+    hours = {
+        kind: sum(
+            c.provenance["seconds"] for c in cells.values() if (c.kind == "train") == (kind == "training")
+        )
+        / 3600
+        for kind in ("training", "everything else")
+    }
+    spent = ", ".join(f"{kind} {value:.2f} h" for kind, value in hours.items())
+    return f"{', '.join(versions)}. Time of all cells, one thread each: {spent}."

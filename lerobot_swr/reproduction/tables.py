@@ -1,0 +1,265 @@
+"""Tables of the report, from summaries."""
+
+from collections.abc import Sequence
+
+from lerobot_swr.evaluation.length_control import BIN_WIDTH, TOLERANCE
+from lerobot_swr.evaluation.metrics import Interval
+from lerobot_swr.evaluation.report import Table
+from lerobot_swr.reproduction import paper
+from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
+from lerobot_swr.reproduction.suites import CONDITIONS, LENGTH_BAND
+from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval, length_control
+
+NOTHING = "–"
+
+INTERVALS = (
+    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
+    "would score as the mean over as many seeds [central 95 %]. Success and style fidelity: over all rollouts "
+    "[Wilson 95 %], lowest to highest seed in parentheses."
+)
+
+
+def number(value: float | None) -> str:
+    """Three decimals, or a dash."""
+    return NOTHING if value is None else f"{value:.3f}"
+
+
+def bracket(interval: Interval) -> str:
+    """An interval."""
+    return f"[{interval.low:.3f}, {interval.high:.3f}]"
+
+
+def share(rate: Rate | None) -> str:
+    """A share with its interval and the range over seeds."""
+    if rate is None:
+        return NOTHING
+    return f"{rate.mean:.3f} {bracket(rate.interval)} ({min(rate.by_seed):.2f} to {max(rate.by_seed):.2f})"
+
+
+def l1(summary: Summary | None) -> str:
+    """L1 with its interval."""
+    return NOTHING if summary is None else f"{summary.l1:.3f} {bracket(summary.l1_interval)}"
+
+
+def floor(summary: Summary | None) -> str:
+    """The floor with its band."""
+    return NOTHING if summary is None else f"{summary.floor.mean:.3f} {bracket(summary.floor.band)}"
+
+
+def steps(cell: StoredCell) -> str:
+    """Training steps and batch size."""
+    return NOTHING if cell.training is None else f"{cell.training['steps']:,} × {cell.training['batch_size']}"
+
+
+def rollouts(summary: Summary) -> str:
+    """Seeds and rollouts."""
+    return f"{summary.n_seeds} × {summary.n_rollouts}"
+
+
+def table1(suite: SuiteResults, dataset: str) -> Table:
+    """Diversity on one dataset: the paper's Table 1."""
+    rows = []
+    for cell in suite.evaluations(dataset):
+        uniform, stratified = cell.summaries["uniform"], cell.summaries.get("stratified")
+        rows.append(
+            (
+                cell.labels.policy,
+                steps(cell),
+                rollouts(uniform),
+                l1(uniform),
+                floor(uniform),
+                number(paper.TABLE1_L1.get((dataset, cell.labels.policy))),
+                l1(stratified),
+                NOTHING if stratified is None else f"{stratified.floor.mean:.3f}",
+                share(cell.best.success),
+                share(cell.best.fidelity),
+                f"{cell.best.coverage:.3f}",
+            )
+        )
+    header = (
+        "policy",
+        "steps × batch",
+        "seeds × n",
+        "L1 uniform",
+        "floor",
+        "paper's L1",
+        "L1 stratified",
+        "its floor",
+        "success",
+        "style fidelity",
+        "coverage",
+    )
+    description = suite.datasets[dataset]
+    caption = (
+        f"{dataset}: {len(description.result['behavior'])} demonstrations, {len(description.histogram)} "
+        f"behaviours. {INTERVALS} Success, fidelity and coverage are those of the stratified rollouts, where "
+        "the policy has styles."
+    )
+    return Table(caption, header, rows)
+
+
+def robustness(suite: SuiteResults, dataset: str) -> Table:
+    """Perturbed starts and transitions: the paper's Table 2."""
+    rows = []
+    for condition in CONDITIONS:
+        for cell in suite.evaluations(dataset):
+            if cell.labels.condition == condition:
+                summary, uniform = cell.best, cell.summaries["uniform"]
+                styled = "stratified" in cell.summaries
+                rows.append(
+                    (
+                        condition,
+                        cell.labels.policy,
+                        rollouts(summary),
+                        share(summary.success),
+                        share(summary.fidelity),
+                        l1(summary) if styled else NOTHING,
+                        l1(uniform),
+                        floor(uniform),
+                    )
+                )
+    header = (
+        "condition",
+        "policy",
+        "seeds × n",
+        "success",
+        "style match",
+        "L1 stratified",
+        "L1 uniform",
+        "floor",
+    )
+    quoted = ", ".join(f"{value:.3f}" for value in paper.ROBUSTNESS_WZBC_SUCCESS)
+    caption = (
+        f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
+        "anywhere; transition noise: standard deviation of one largest step (0.02 of the side) on every step. "
+        f"{INTERVALS} Style match: rollouts that show the behaviour of the demonstration whose style they use. "
+        f"The paper's WZBC on only_forward, in its own maze, under its three perturbations: success {quoted} "
+        "(which is which could not be checked)."
+    )
+    return Table(caption, header, rows)
+
+
+def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
+    """Every WZBC against ZBC under the same starts and noise."""
+    cells = {(c.labels.policy, c.labels.condition): c for c in suite.evaluations(dataset)}
+    rows = []
+    for (policy, condition), cell in cells.items():
+        reference = cells.get(("zbc", condition))
+        if policy.startswith("wzbc") and reference is not None:
+            row = [condition, policy]
+            for column in (0, 1):
+                mean, interval = difference_interval(
+                    [outcomes[:, column] for outcomes in cell.best.outcomes],
+                    [outcomes[:, column] for outcomes in reference.best.outcomes],
+                )
+                clear = interval.low > 0 or interval.high < 0
+                row.append(f"{mean:+.3f} {bracket(interval)}{' *' if clear else ''}")
+            rows.append(row)
+    order = list(dict.fromkeys(condition for _, condition in cells))
+    rows.sort(key=lambda row: order.index(row[0]))
+    caption = (
+        f"{dataset}: WZBC minus ZBC, each style once [95 % bootstrap interval over seeds and rollouts; "
+        "* it leaves out 0]."
+    )
+    return Table(caption, ("condition", "policy", "success", "style match"), rows)
+
+
+def teaching(cell: StoredCell) -> Table:
+    """Who teaches a style, for each beta and p."""
+    same, other = cell.result["nu_same"], cell.result["nu_other"]
+    rows = [
+        (
+            f"{row['beta']:g}",
+            f"{row['p']:g}",
+            f"{row['own']:.3f}",
+            f"{row['same']:.3f}",
+            f"{row['other']:.3f}",
+        )
+        for row in cell.result["shares"]
+    ]
+    caption = (
+        f"{cell.labels.dataset}: who teaches a style, as shares of its total weight in algorithm 1's expected "
+        f"loss, mean over styles. ν of pairs with the same behaviour: 10 %, 50 %, 90 % quantiles "
+        f"{', '.join(f'{v:.2f}' for v in same)}; with another: {', '.join(f'{v:.2f}' for v in other)}."
+    )
+    header = ("β", "p", "own demonstration", "others, same behaviour", "other behaviours")
+    return Table(caption, header, rows)
+
+
+def control(suite: SuiteResults, dataset: str) -> Table:
+    """Control of the episode length."""
+    rows = []
+    description = suite.datasets[dataset].result
+    for cell in suite.evaluations(dataset):
+        result, by_seed = length_control(cell.result, description, LENGTH_BAND)
+        summary = cell.summaries["uniform"]
+        mean = sum(by_seed) / len(by_seed)
+        rows.append(
+            (
+                cell.labels.policy,
+                "controlled" if cell.labels.condition == "controlled" else "free",
+                rollouts(summary),
+                f"{mean:.3f} ({min(by_seed):.3f} to {max(by_seed):.3f})",
+                f"{result.l1:.3f}",
+                f"{result.l1_floor:.3f} [{result.l1_floor_band.low:.3f}, {result.l1_floor_band.high:.3f}]",
+                f"{result.in_band:.3f}",
+                share(summary.success),
+                NOTHING,
+            )
+        )
+    low, high = LENGTH_BAND
+    n = sum(low <= length <= high for length in description["length"])
+    caption = (
+        f"{dataset}: lengths of rollouts against those of the {n} demonstrations of {low} to {high} frames; "
+        f"bins of {BIN_WIDTH} steps, styles drawn uniformly. Controlled: only styles of demonstrations in the "
+        f"band. L1 per seed: mean (lowest to highest seed); L1 of all: of all seeds' rollouts together, with "
+        f"the floor of as many draws [central 95 %]. In band: share of rollouts within it, ± {TOLERANCE} steps. "
+        f"{description['frames_after_end']} frames, which demonstrations record after the environment would "
+        "have ended them, are added to the rollouts' lengths. The paper shows this as a figure, without "
+        "numbers that could be checked."
+    )
+    header = (
+        "policy",
+        "styles",
+        "seeds × n",
+        "L1 per seed",
+        "L1 of all",
+        "floor",
+        "in band",
+        "success",
+        "paper",
+    )
+    return Table(caption, header, rows)
+
+
+def sweep(cells: Sequence[StoredCell]) -> Table:
+    """Effect of beta and p."""
+    rows = []
+    for cell in cells:
+        assert cell.training is not None
+        options = cell.training["options"]
+        rows.append(
+            (
+                f"{options['beta']:g}",
+                f"{options['p']:g}",
+                steps(cell),
+                rollouts(cell.best),
+                l1(cell.summaries["uniform"]),
+                floor(cell.summaries["uniform"]),
+                l1(cell.summaries["stratified"]),
+                share(cell.best.success),
+                share(cell.best.fidelity),
+            )
+        )
+    header = (
+        "β",
+        "p",
+        "steps × batch",
+        "seeds × n",
+        "L1 uniform",
+        "floor",
+        "L1 stratified",
+        "success",
+        "style fidelity",
+    )
+    return Table(f"{cells[0].labels.dataset}: WZBC with other β and p. {INTERVALS}", header, rows)

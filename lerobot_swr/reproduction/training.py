@@ -1,0 +1,136 @@
+"""Computes a training cell with the training commands, one ordinary LeRobot run per seed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lerobot_swr.reproduction.cells import Cell, Store
+
+STACKED = ("bc", "zbc", "wzbc")  # trained by lerobot-swr-train, all seeds at once
+CHECKPOINTS = 10  # periodic checkpoints of a training, from which it resumes
+
+
+def train(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:
+    """Train all seeds of a cell, or go on where an interrupted attempt stopped.
+
+    Args:
+        cell: A training cell.
+        store: Where its checkpoints go.
+        dataset: Folder of the dataset.
+        lock: The cell's lock, which the training processes hold as well.
+
+    Returns:
+        The result: seed to checkpoint folder, relative to the store.
+
+    Raises:
+        ChildProcessError: If a training fails; the cell's log says why.
+    """
+    definition = cell.definition
+    output_dir = store.work_folder(cell) / "run"
+    if definition["policy"] in STACKED:
+        seeds = ",".join(str(seed) for seed in definition["seeds"])
+        flags = [f"--seeds={seeds}", "--jobs=1", "--resume=true"]
+        _run(_lerobot_swr_train(), cell, store, dataset, output_dir, flags, lock)
+    else:
+        for seed in definition["seeds"]:
+            _train_alone(cell, store, dataset, output_dir / f"seed_{seed}", seed, lock)
+    for seed in definition["seeds"]:
+        _keep_the_last_checkpoint(output_dir / f"seed_{seed}")
+    return {
+        "checkpoints": {
+            str(seed): str(checkpoint_folder(cell, store, seed).relative_to(store.root))
+            for seed in definition["seeds"]
+        }
+    }
+
+
+def checkpoint_folder(cell: Cell, store: Store, seed: int) -> Path:
+    """The trained policy of one seed."""
+    step = f"{cell.definition['steps']:06d}"
+    return store.work_folder(cell) / "run" / f"seed_{seed}" / "checkpoints" / step / "pretrained_model"
+
+
+def steps_done(cell: Cell, store: Store) -> float:
+    """Share of a training that its periodic checkpoints hold, 0 to 1."""
+    seeds = cell.definition["seeds"]
+    folders = (store.work_folder(cell) / "run").glob("seed_*/checkpoints")
+    saved = [max((int(p.name) for p in f.iterdir() if p.name.isdigit()), default=0) for f in folders]
+    return min(1.0, sum(saved) / (len(seeds) * cell.definition["steps"]))
+
+
+def _train_alone(cell: Cell, store: Store, dataset: Path, run: Path, seed: int, lock: int) -> None:
+    """One seed by lerobot-train."""
+    if checkpoint_folder(cell, store, seed).is_dir():
+        return
+    config = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
+    executable = [str(Path(sys.executable).with_name("lerobot-train"))]
+    if config.is_file():
+        _execute([*executable, f"--config_path={config}", "--resume=true"], cell, store, lock)
+        return
+    if run.exists():  # interrupted before its first checkpoint
+        shutil.rmtree(run)
+    _run(executable, cell, store, dataset, run, [f"--seed={seed}", "--num_workers=0"], lock)
+
+
+def _run(
+    executable: Sequence[str],
+    cell: Cell,
+    store: Store,
+    dataset: Path,
+    output_dir: Path,
+    more: Sequence[str],
+    lock: int,
+) -> None:
+    definition = cell.definition
+    steps = definition["steps"]
+    options = [f"--policy.{key}={_flag(value)}" for key, value in definition["options"].items()]
+    command = [
+        *executable,
+        f"--policy.type={definition['policy']}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        *options,
+        f"--dataset.repo_id=local/{dataset.name}",
+        f"--dataset.root={dataset}",
+        f"--batch_size={definition['batch_size']}",
+        f"--steps={steps}",
+        f"--save_freq={-(-steps // CHECKPOINTS)}",
+        f"--log_freq={max(1, steps // 100)}",
+        f"--output_dir={output_dir}",
+        *more,
+    ]
+    _execute(command, cell, store, lock)
+
+
+def _execute(command: Sequence[str], cell: Cell, store: Store, lock: int) -> None:
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    with store.log_path(cell).open("a") as log:
+        log.write(f"$ {' '.join(command)}\n")
+        log.flush()
+        run = subprocess.run(
+            list(command), stdout=log, stderr=subprocess.STDOUT, env=one_thread, pass_fds=(lock,)
+        )
+    if run.returncode != 0:
+        raise ChildProcessError(f"the training of {cell.labels} ended with status {run.returncode}")
+
+
+def _lerobot_swr_train() -> list[str]:
+    return [sys.executable, "-c", "from lerobot_swr.cli.train import main; main()"]
+
+
+def _flag(value: Any) -> str:
+    """A value as LeRobot's command line reads it."""
+    return yaml.safe_dump(value, default_flow_style=True, width=10_000).removesuffix("\n...\n").strip()
+
+
+def _keep_the_last_checkpoint(run: Path) -> None:
+    last = (run / "checkpoints" / "last").resolve().name
+    for folder in (run / "checkpoints").iterdir():
+        if folder.name not in ("last", last):
+            shutil.rmtree(folder)
