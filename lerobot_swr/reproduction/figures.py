@@ -21,7 +21,7 @@ from lerobot_swr.evaluation.plots import (
 from lerobot_swr.reproduction.demonstrations import environment
 from lerobot_swr.reproduction.stored_results import DatasetDescription, StoredCell
 from lerobot_swr.reproduction.suites import LENGTH_BAND
-from lerobot_swr.reproduction.summary import Summary, length_control
+from lerobot_swr.reproduction.summary import Rate, Summary, length_control
 
 Paths = list[tuple[np.ndarray, str]]
 
@@ -69,12 +69,8 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell]) -> None:
     """Success, style match and L1 over the size of the perturbation, a line per policy."""
     policies = list(dict.fromkeys(cell.labels.policy for cell in cells))
     measures: dict[str, Callable[[Summary], tuple[float, float, float] | None]] = {
-        "success": lambda s: (s.success.mean, s.success.interval.low, s.success.interval.high),
-        "style match": lambda s: (
-            None
-            if s.fidelity is None
-            else (s.fidelity.mean, s.fidelity.interval.low, s.fidelity.interval.high)
-        ),
+        "success": lambda s: _mean_and_interval(s.success),
+        "style match": lambda s: None if s.fidelity is None else _mean_and_interval(s.fidelity),
         "L1 (each style once)": lambda s: (s.l1, s.l1_interval.low, s.l1_interval.high),
     }
     perturbations: dict[str, Callable[[Mapping], float | None]] = {
@@ -99,6 +95,10 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell]) -> None:
             axes.set(xlabel=x_label, ylabel=y_label, ylim=(0, 2) if y_label.startswith("L1") else (0, 1.02))
     grid[0, 0].legend(fontsize=8)
     _save(figure, path)
+
+
+def _mean_and_interval(rate: Rate) -> tuple[float, float, float]:
+    return rate.mean, rate.interval.low, rate.interval.high
 
 
 def _start_radius(env: Mapping) -> float | None:

@@ -58,12 +58,11 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     env_seed = definition["seed"] * (seed + 1)
     rollouts = run_rollouts(checkpoint, env_cfg, env_cfg.behavior_rule(), count, BATCH_SIZE, env_seed)
     filtered = definition["style_filter"] is not None
+    drawn = rollouts if definition["paths"] else []
     return {
         "rollouts": _columns(rollouts),
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
-        "paths": [short_path(path_of(env_cfg, r.observations)) for r in rollouts]
-        if definition["paths"]
-        else [],
+        "paths": [short_path(path_of(env_cfg, rollout.observations)) for rollout in drawn],
     }
 
 

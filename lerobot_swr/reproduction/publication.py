@@ -43,8 +43,16 @@ def readme_block(root: Path) -> str:
     if "table1" not in suites:
         raise ValueError(f"{str(root)!r} has no results of the suite table1")
     suite = suites["table1"]
-    header = ("dataset", "policy", "steps", "seeds × n", "L1 stratified", "L1 uniform (floor)", "success",
-              "style fidelity")  # fmt: skip
+    header = (
+        "dataset",
+        "policy",
+        "steps",
+        "seeds × n",
+        "L1 stratified",
+        "L1 uniform (floor)",
+        "success",
+        "style fidelity",
+    )
     rows = [_readme_row(cell) for name in suite.datasets for cell in suite.evaluations(name)]
     lines = [header, ("---",) * len(header), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
@@ -58,11 +66,10 @@ def update_readme(readme: Path, root: Path) -> None:
     """
     write_text(readme, with_block(readme.read_text(encoding="utf-8"), readme_block(root), readme))
     suite = load_suites(root)["table1"]
-    pictured = [
-        c for c in suite.cells if (c.labels.dataset, c.labels.policy) == PICTURED and c.kind == "evaluate"
-    ]
+    dataset, policy = PICTURED
+    pictured = [cell for cell in suite.evaluations(dataset) if cell.labels.policy == policy]
     if pictured:
-        figures.plot_result(root / PICTURE, suite.datasets[PICTURED[0]], pictured[0])
+        figures.plot_result(root / PICTURE, suite.datasets[dataset], pictured[0])
 
 
 def with_block(text: str, block: str, readme: Path) -> str:

@@ -16,8 +16,8 @@ INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
     "demonstrators and the sizes of the perturbations are this package's own, so the paper's numbers beside "
     "ours tell the order of magnitude and nothing more; a dash stands where none could be checked. L1 is the "
-    "distance of the behaviour histograms of rollouts and demonstrations, 0 (equal) to 2 (disjoint); a failed "
-    "rollout is a behaviour of its own. Drawing styles uniformly (the paper's protocol), even a perfect "
+    "distance of the behaviour histograms of rollouts and demonstrations, 0 (equal) to 2 (disjoint); failed "
+    "rollouts are behaviours of their own. Drawing styles uniformly (the paper's protocol), even a perfect "
     "reproducer scores the floor; with each style used once (stratified) its L1 is 0."
 )
 
@@ -75,8 +75,8 @@ def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
                     paths,
                 ),
                 Picture(
-                    "Behaviour histograms: demonstrations, and all seeds' rollouts of each policy (each style "
-                    "once, where it has styles).",
+                    "Behaviour histograms: demonstrations, and all seeds' rollouts of each policy (each "
+                    "style once, where it has styles).",
                     histograms,
                 ),
             ],
@@ -90,8 +90,8 @@ def _baseline_note(suite: SuiteResults, dataset: str) -> list[str]:
         return []
     names = ", ".join(c.labels.policy for c in others)
     return [
-        f"{names}: small networks that a CPU trains, and fewer steps and seeds than ours (see the table). They "
-        "show how other kinds of policy behave on these data, not what they could reach."
+        f"{names}: small networks that a CPU trains, and fewer steps and seeds than ours (see the table). "
+        "They show how other kinds of policy behave on these data, not what they could reach."
     ]
 
 
@@ -204,12 +204,10 @@ def _versions(suites: dict[str, SuiteResults]) -> str:
     versions = dict.fromkeys(
         f"{name} {number}" for c in cells.values() for name, number in c.provenance["versions"].items()
     )
-    hours = {
-        kind: sum(
-            c.provenance["seconds"] for c in cells.values() if (c.kind == "train") == (kind == "training")
-        )
-        / 3600
-        for kind in ("training", "everything else")
-    }
-    spent = ", ".join(f"{kind} {value:.2f} h" for kind, value in hours.items())
-    return f"{', '.join(versions)}. Time of all cells, one thread each: {spent}."
+    seconds = {True: 0.0, False: 0.0}
+    for cell in cells.values():
+        seconds[cell.kind == "train"] += cell.provenance["seconds"]
+    return (
+        f"{', '.join(versions)}. Time of all cells, one thread each: training {seconds[True] / 3600:.2f} h, "
+        f"everything else {seconds[False] / 3600:.2f} h."
+    )

@@ -39,7 +39,7 @@ class ReproductionSettings:
     policy_options: dict[str, Any] = field(default_factory=dict)
     # Where everything is written.
     output_dir: Path = Path("outputs/reproduction")
-    # Folder of the datasets, by name; those of the package that are absent are made. null: OUTPUT_DIR/datasets.
+    # Folder of the datasets, by name; absent ones of the package are made. null: OUTPUT_DIR/datasets.
     dataset_dir: Path | None = None
     # Trainings and evaluations that run at once, one thread each; null takes joblib's active configuration.
     jobs: int | None = os.cpu_count()

@@ -1,4 +1,4 @@
-"""Computes what the figures show without rollouts: dissimilarities, eq. 3, who teaches whom, maps of styles."""
+"""What figures show without rollouts: dissimilarities, eq. 3, who teaches whom, maps of styles."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""The paper's experiments as lists of cells. What is compared with what is fixed here, before any training."""
+"""The paper's experiments as lists of cells: what is compared is fixed here, before any training."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,10 +1,11 @@
-"""Figures of a finished evaluation cell, over training seeds and rollouts. Pure functions of stored results."""
+"""Figures of an evaluation cell over training seeds and rollouts: pure functions of stored results."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lerobot_swr.evaluation.length_control import LengthControlResult, evaluate_length_control
 from lerobot_swr.evaluation.metrics import (
@@ -120,7 +121,7 @@ def rate(outcomes_by_seed: Sequence[Sequence[int]]) -> Rate:
 
 
 def difference_interval(
-    first: Sequence[Sequence[float]], second: Sequence[Sequence[float]], seed: int = 0
+    first: Sequence[ArrayLike], second: Sequence[ArrayLike], seed: int = 0
 ) -> tuple[float, Interval]:
     """Difference of two policies' mean outcome, with its 95 % bootstrap interval over seeds and rollouts.
 
@@ -134,10 +135,10 @@ def difference_interval(
     """
     rng = np.random.default_rng(seed)
 
-    def resample(outcomes_by_seed: Sequence[Sequence[float]]) -> np.ndarray:
+    def resample(outcomes_by_seed: Sequence[ArrayLike]) -> np.ndarray:
         """(BOOTSTRAP_DRAWS,) means of resampled seeds and rollouts."""
         means = [np.mean(outcomes) for outcomes in outcomes_by_seed]
-        sizes = [len(outcomes) for outcomes in outcomes_by_seed]
+        sizes = [np.size(outcomes) for outcomes in outcomes_by_seed]
         chosen = rng.integers(len(means), size=(BOOTSTRAP_DRAWS, len(means)))
         drawn = rng.binomial(np.array(sizes)[chosen], np.array(means)[chosen]) / np.array(sizes)[chosen]
         return drawn.mean(axis=1)

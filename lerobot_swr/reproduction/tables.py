@@ -14,8 +14,8 @@ NOTHING = "–"
 
 INTERVALS = (
     "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
-    "would score as the mean over as many seeds [central 95 %]. Success and style fidelity: over all rollouts "
-    "[Wilson 95 %], lowest to highest seed in parentheses."
+    "would score as the mean over as many seeds [central 95 %]. Success and style fidelity: over all "
+    "rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
 
 
@@ -131,9 +131,9 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
     quoted = ", ".join(f"{value:.3f}" for value in paper.ROBUSTNESS_WZBC_SUCCESS)
     caption = (
         f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
-        "anywhere; transition noise: standard deviation of one largest step (0.02 of the side) on every step. "
-        f"{INTERVALS} Style match: rollouts that show the behaviour of the demonstration whose style they use. "
-        f"The paper's WZBC on only_forward, in its own maze, under its three perturbations: success {quoted} "
+        "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of the "
+        f"side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style they "
+        f"use. The paper's WZBC on only_forward, in its own maze, under its three perturbations: success {quoted} "
         "(which is which could not be checked)."
     )
     return Table(caption, header, rows)
@@ -178,8 +178,8 @@ def teaching(cell: StoredCell) -> Table:
         for row in cell.result["shares"]
     ]
     caption = (
-        f"{cell.labels.dataset}: who teaches a style, as shares of its total weight in algorithm 1's expected "
-        f"loss, mean over styles. ν of pairs with the same behaviour: 10 %, 50 %, 90 % quantiles "
+        f"{cell.labels.dataset}: who teaches a style, as shares of its total weight in algorithm 1's "
+        f"expected loss, mean over styles. ν of pairs with the same behaviour: 10 %, 50 %, 90 % quantiles "
         f"{', '.join(f'{v:.2f}' for v in same)}; with another: {', '.join(f'{v:.2f}' for v in other)}."
     )
     header = ("β", "p", "own demonstration", "others, same behaviour", "other behaviours")
@@ -211,9 +211,9 @@ def control(suite: SuiteResults, dataset: str) -> Table:
     n = sum(low <= length <= high for length in description["length"])
     caption = (
         f"{dataset}: lengths of rollouts against those of the {n} demonstrations of {low} to {high} frames; "
-        f"bins of {BIN_WIDTH} steps, styles drawn uniformly. Controlled: only styles of demonstrations in the "
-        f"band. L1 per seed: mean (lowest to highest seed); L1 of all: of all seeds' rollouts together, with "
-        f"the floor of as many draws [central 95 %]. In band: share of rollouts within it, ± {TOLERANCE} steps. "
+        f"bins of {BIN_WIDTH} steps, styles drawn uniformly. Controlled: only styles of demonstrations in "
+        f"the band. L1 per seed: mean (lowest to highest seed); L1 of all: of all seeds' rollouts together, "
+        f"with the floor of as many draws [central 95 %]. In band: rollouts within it, ± {TOLERANCE} steps. "
         f"{description['frames_after_end']} frames, which demonstrations record after the environment would "
         "have ended them, are added to the rollouts' lengths. The paper shows this as a figure, without "
         "numbers that could be checked."
