@@ -14,14 +14,16 @@ TEMPLATE = """<!doctype html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{{ title }}</title>
 <style>
-  body { font: 16px/1.55 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color:
-  #222; } h1 { font-size: 1.7rem; } h2 { font-size: 1.25rem; margin-top: 2.2rem; }
+  body { font: 16px/1.55 system-ui, sans-serif; max-width: 72rem; margin: 2rem auto; padding: 0 1rem;
+  color: #222; }
+  h1 { font-size: 1.7rem; } h2 { font-size: 1.25rem; margin-top: 2.2rem; }
   img { max-width: 100%; display: block; }
   figure { margin: 1.2rem 0; } figcaption, .note { color: #555; font-size: .9rem; }
   .scroll { overflow-x: auto; }
-  table { border-collapse: collapse; margin: 1rem 0; } caption { text-align: left; color: #555; font-size:
-  .9rem; } th, td { padding: .3rem .8rem; text-align: right; border-bottom: 1px solid #ddd; white-space:
-  nowrap; } th:first-child, td:first-child { text-align: left; } thead th { border-bottom: 2px solid #888; }
+  table { border-collapse: collapse; margin: 1rem 0; font-size: .9rem; }
+  th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #ddd; white-space: pre;
+  vertical-align: top; line-height: 1.35; }
+  th:first-child, td:first-child { text-align: left; } thead th { border-bottom: 2px solid #888; }
   pre { background: #f5f5f5; padding: .8rem; overflow-x: auto; font-size: .82rem; }
 </style>
 </head>
@@ -34,8 +36,8 @@ TEMPLATE = """<!doctype html>
 <p>{{ paragraph }}</p>
 {% endfor %}
 {% for table in section.tables %}
+<p class="note">{{ table.caption }}</p>
 <div class="scroll"><table>
-<caption>{{ table.caption }}</caption>
 <thead><tr>{% for cell in table.header %}<th>{{ cell }}</th>{% endfor %}</tr></thead>
 <tbody>
 {% for row in table.rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>

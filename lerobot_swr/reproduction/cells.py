@@ -65,8 +65,8 @@ class Cell:
     @property
     def slug(self) -> str:
         """Name of the cell's file and folder."""
-        words = "-".join((self.kind, self.labels.dataset, self.labels.policy, self.labels.condition))
-        readable = "".join(c if c.isalnum() or c in "-_." else "_" for c in words)
+        words = (self.kind, self.labels.dataset, self.labels.policy, self.labels.condition)
+        readable = "".join(c if c.isalnum() or c in "-_." else "_" for c in "-".join(filter(None, words)))
         return f"{readable}-{self.key}"
 
 

@@ -138,7 +138,11 @@ def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
         store.failure_path(cell).unlink(missing_ok=True)
         start = time.monotonic()
         try:
-            with store.log_path(cell).open("a") as log, contextlib.redirect_stderr(log):
+            with (
+                store.log_path(cell).open("a") as log,
+                contextlib.redirect_stdout(log),
+                contextlib.redirect_stderr(log),
+            ):
                 result = _compute(cell, store, dataset, lock)
         except Exception as error:
             with store.log_path(cell).open("a") as log:

@@ -46,6 +46,8 @@ def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Seque
         axes.set_title(f"{cell.labels.policy}: L1 {summary.l1:.3f} ({summary.protocol})", fontsize=10)
         axes.tick_params(axis="x", labelsize=7)
         axes.set(xlabel="")
+        if cell is not cells[0]:
+            axes.get_legend().remove()
     for axes in grid:
         axes.set_axis_off()
     _save(figure, path)

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import draccus
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_swr.reproduction.cells import Cell, Labels
@@ -146,10 +147,13 @@ def training(
         baseline = BASELINES[policy]
         all_options, batch_size = dict(baseline.options), baseline.batch_size
         default_steps, default_seeds = getattr(settings, baseline.steps), settings.baseline_seeds
+    config = PreTrainedConfig.get_choice_class(policy)(device="cpu", push_to_hub=False, **all_options)
     definition = {
         "fingerprint": demos.fingerprint,
         "policy": policy,
         "options": all_options,
+        # Whole, so that a default that changes with the package makes another cell.
+        "config": draccus.encode(config, PreTrainedConfig),
         "batch_size": batch_size,
         "steps": steps or default_steps,
         "seeds": list(range(seeds or default_seeds)),

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from lerobot_swr.evaluation.length_control import LengthControlResult, evaluate_length_control
 from lerobot_swr.evaluation.metrics import (
@@ -121,7 +120,7 @@ def rate(outcomes_by_seed: Sequence[Sequence[int]]) -> Rate:
 
 
 def difference_interval(
-    first: Sequence[ArrayLike], second: Sequence[ArrayLike], seed: int = 0
+    first: Sequence[np.ndarray], second: Sequence[np.ndarray], seed: int = 0
 ) -> tuple[float, Interval]:
     """Difference of two policies' mean outcome, with its 95 % bootstrap interval over seeds and rollouts.
 
@@ -135,10 +134,10 @@ def difference_interval(
     """
     rng = np.random.default_rng(seed)
 
-    def resample(outcomes_by_seed: Sequence[ArrayLike]) -> np.ndarray:
+    def resample(outcomes_by_seed: Sequence[np.ndarray]) -> np.ndarray:
         """(BOOTSTRAP_DRAWS,) means of resampled seeds and rollouts."""
         means = [np.mean(outcomes) for outcomes in outcomes_by_seed]
-        sizes = [np.size(outcomes) for outcomes in outcomes_by_seed]
+        sizes = [len(outcomes) for outcomes in outcomes_by_seed]
         chosen = rng.integers(len(means), size=(BOOTSTRAP_DRAWS, len(means)))
         drawn = rng.binomial(np.array(sizes)[chosen], np.array(means)[chosen]) / np.array(sizes)[chosen]
         return drawn.mean(axis=1)

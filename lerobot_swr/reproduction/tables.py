@@ -33,17 +33,18 @@ def share(rate: Rate | None) -> str:
     """A share with its interval and the range over seeds."""
     if rate is None:
         return NOTHING
-    return f"{rate.mean:.3f} {bracket(rate.interval)} ({min(rate.by_seed):.2f} to {max(rate.by_seed):.2f})"
+    seeds = f"({min(rate.by_seed):.2f} to {max(rate.by_seed):.2f})"
+    return f"{rate.mean:.3f}\n{bracket(rate.interval)}\n{seeds}"
 
 
 def l1(summary: Summary | None) -> str:
     """L1 with its interval."""
-    return NOTHING if summary is None else f"{summary.l1:.3f} {bracket(summary.l1_interval)}"
+    return NOTHING if summary is None else f"{summary.l1:.3f}\n{bracket(summary.l1_interval)}"
 
 
 def floor(summary: Summary | None) -> str:
     """The floor with its band."""
-    return NOTHING if summary is None else f"{summary.floor.mean:.3f} {bracket(summary.floor.band)}"
+    return NOTHING if summary is None else f"{summary.floor.mean:.3f}\n{bracket(summary.floor.band)}"
 
 
 def steps(cell: StoredCell) -> str:
@@ -131,10 +132,10 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
     quoted = ", ".join(f"{value:.3f}" for value in paper.ROBUSTNESS_WZBC_SUCCESS)
     caption = (
         f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
-        "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of the "
-        f"side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style they "
-        f"use. The paper's WZBC on only_forward, in its own maze, under its three perturbations: success {quoted} "
-        "(which is which could not be checked)."
+        "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
+        f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
+        "they use. The paper's WZBC on only_forward, in its own maze, under its three perturbations: "
+        f"success {quoted} (which is which could not be checked)."
     )
     return Table(caption, header, rows)
 
@@ -153,7 +154,7 @@ def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
                     [outcomes[:, column] for outcomes in reference.best.outcomes],
                 )
                 clear = interval.low > 0 or interval.high < 0
-                row.append(f"{mean:+.3f} {bracket(interval)}{' *' if clear else ''}")
+                row.append(f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}")
             rows.append(row)
     order = list(dict.fromkeys(condition for _, condition in cells))
     rows.sort(key=lambda row: order.index(row[0]))
@@ -199,9 +200,9 @@ def control(suite: SuiteResults, dataset: str) -> Table:
                 cell.labels.policy,
                 "controlled" if cell.labels.condition == "controlled" else "free",
                 rollouts(summary),
-                f"{mean:.3f} ({min(by_seed):.3f} to {max(by_seed):.3f})",
+                f"{mean:.3f}\n({min(by_seed):.3f} to {max(by_seed):.3f})",
                 f"{result.l1:.3f}",
-                f"{result.l1_floor:.3f} [{result.l1_floor_band.low:.3f}, {result.l1_floor_band.high:.3f}]",
+                f"{result.l1_floor:.3f}\n{bracket(result.l1_floor_band)}",
                 f"{result.in_band:.3f}",
                 share(summary.success),
                 NOTHING,

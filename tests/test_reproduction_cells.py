@@ -1,0 +1,280 @@
+"""Cells of the paper's experiments: identity, storage, resuming, failures."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import save_checkpoint
+
+from lerobot_swr.reproduction import execution, measurement
+from lerobot_swr.reproduction.cells import Cell, Labels, Store
+from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
+from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
+from lerobot_swr.reproduction.settings import ReproductionSettings
+from lerobot_swr.reproduction.suites import BASELINES, evaluation, known_policies, suite_cells, training
+from lerobot_swr.reproduction.training import checkpoint_folder
+
+
+def cell(**definition) -> Cell:
+    """A cell without a training."""
+    return Cell("similarity", Labels("data", "", "similarity"), definition)
+
+
+@pytest.fixture
+def store(tmp_path) -> Store:
+    """An empty folder of results."""
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def demos(small_maze, store) -> Demonstrations:
+    """The small maze, described."""
+    return prepare(small_maze.name, small_maze.parent, store)
+
+
+@pytest.fixture
+def settings(tmp_path) -> ReproductionSettings:
+    """Two seeds, twelve rollouts."""
+    return ReproductionSettings(
+        steps=20, seeds=2, n_rollouts=12, policy_options={"hidden_dim": 16}, output_dir=tmp_path / "store"
+    )
+
+
+@pytest.fixture
+def trained(settings, demos, store, make_tiny_policy, small_maze_meta) -> Cell:
+    """A finished training cell of zbc; its policies are fresh ones, all of their styles marked as trained."""
+    one = training(settings, demos, "zbc")
+    for seed in one.definition["seeds"]:
+        policy = make_tiny_policy("zbc", seed=seed)
+        policy.styles.trained[:] = 1
+        save_checkpoint(policy, small_maze_meta, checkpoint_folder(one, store, seed))
+    store.write(one, {}, 0.0)
+    return one
+
+
+def test_what_defines_a_cell_is_its_identity():
+    """The same definition is the same cell whatever it is called and however it is ordered; others are not."""
+    one = cell(a=1, b=[2])
+    assert Cell("similarity", Labels("other", "x", "y"), {"b": [2], "a": 1}).key == one.key
+    others = [cell(a=1), cell(a=1, b=[3]), Cell("styles", one.labels, one.definition)]
+    others.append(Cell("similarity", one.labels, one.definition, needs=one))
+    assert len({other.key for other in [one, *others]}) == 5
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("steps", 21), ("seeds", 3), ("batch_size", 8), ("policy_options", {"hidden_dim": 17}), ("n_rollouts", 9)],
+)
+def test_a_changed_setting_is_a_new_cell(settings, demos, key, value):
+    """Each setting reaches the key of what is measured."""
+    changed = dataclasses.replace(settings, **{key: value})
+    keys = {evaluation(s, demos, training(s, demos, "zbc"), "x").key for s in (settings, changed)}
+    assert len(keys) == 2
+
+
+def test_other_demonstrations_are_a_new_cell(settings, demos):
+    """The dataset's content counts, not its name."""
+    other = dataclasses.replace(demos, fingerprint="another")
+    renamed = dataclasses.replace(demos, name="renamed")
+    key = training(settings, demos, "zbc").key
+    assert training(settings, other, "zbc").key != key
+    assert training(settings, renamed, "zbc").key == key
+
+
+def test_a_result_appears_complete_or_not_at_all(store, monkeypatch):
+    """Killed while it is written, a cell is not done; nothing but its own file is left afterwards."""
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        store.write(cell(), {"x": 1}, 1.0)
+    assert store.state(cell()) == "waiting"
+    monkeypatch.undo()
+    store.write(cell(), {"x": 1}, 1.0)
+    assert store.read(cell()) == {"x": 1}
+    assert store.state(cell()) == "done"
+
+
+def test_an_interrupted_measurement_goes_on_with_its_next_part(
+    settings, demos, store, trained, monkeypatch, tmp_path
+):
+    """Interrupted after two of four parts: the other two are made, and the result is that of a whole run."""
+    one = evaluation(settings, demos, trained, "deterministic", paths=True)
+    run, calls = measurement.run_rollouts, []
+
+    def counted(*args, **kwargs):
+        if len(calls) == 2:
+            raise KeyboardInterrupt
+        calls.append(args)
+        return run(*args, **kwargs)
+
+    monkeypatch.setattr(measurement, "run_rollouts", counted)
+    roots = {demos.name: demos.root}
+    with pytest.raises(KeyboardInterrupt):
+        run_chain([one], store, roots)
+    assert not store.is_done(one)
+    monkeypatch.setattr(measurement, "run_rollouts", lambda *a, **k: calls.append(a) or run(*a, **k))
+    assert run_chain([one], store, roots) == []
+    assert len(calls) == 4
+
+    whole = Store(tmp_path / "whole")
+    (whole.root / "work").mkdir(parents=True)
+    os.symlink(store.work_folder(trained), whole.work_folder(trained))
+    assert run_chain([one], whole, roots) == []
+    assert whole.read(one) == store.read(one)
+
+
+def test_finished_cells_are_never_computed_again(settings, demos, store, trained, monkeypatch):
+    """A second run of everything computes nothing, even when the checkpoints are gone."""
+    one = evaluation(settings, demos, trained, "deterministic")
+    assert run_cells([trained, one], store, {demos.name: demos}, jobs=1) == []
+    monkeypatch.setattr(execution, "_compute", lambda *_: pytest.fail("computed again"))
+    assert run_cells([trained, one], store, {demos.name: demos}, jobs=1) == []
+    os.rename(store.work_folder(trained), store.root / "gone")
+    assert unfinished_chains([trained, one], store) == []
+
+
+def test_a_training_without_checkpoints_is_repeated_only_for_what_still_needs_it(
+    settings, demos, store, trained
+):
+    """Results alone (published ones) are enough, until a new measurement asks for the policy."""
+    os.rename(store.work_folder(trained), store.root / "gone")
+    one = evaluation(settings, demos, trained, "deterministic")
+    assert unfinished_chains([trained, one], store) == [[trained, one]]
+
+
+def test_a_failed_cell_does_not_stop_the_others(settings, demos, store, trained, monkeypatch):
+    """Two chains, one fails: the other ends; the failure names the cell and its log, and can be repeated."""
+    good = evaluation(settings, demos, trained, "deterministic")
+    bad = suite_cells("figures", settings, [demos])[0]
+    compute = execution._compute
+
+    def failing(one, *args):
+        if one == bad:
+            raise RuntimeError("no luck")
+        return compute(one, *args)
+
+    monkeypatch.setattr(execution, "_compute", failing)
+    [failure] = run_cells([bad, good], store, {demos.name: demos}, jobs=1)
+    assert failure.cell == bad
+    assert "no luck" in failure.message
+    assert "Traceback" in failure.log.read_text()
+    states = format_states([bad, good], store)
+    assert f"failed   {bad.labels}" in states
+    assert states.endswith("1 done, 1 failed, 0 waiting")
+    monkeypatch.undo()
+    assert run_cells([bad, good], store, {demos.name: demos}, jobs=1) == []
+    assert store.state(bad) == "done"
+
+
+def test_a_failed_training_leaves_its_measurements_waiting(settings, demos, store):
+    """The training command's log says why; what needed the policy is not attempted."""
+    broken = dataclasses.replace(demos, root=store.root / "nowhere")
+    trained = training(settings, demos, "zbc")
+    one = evaluation(settings, demos, trained, "deterministic")
+    [failure] = run_cells([trained, one], store, {demos.name: broken}, jobs=1)
+    assert failure.cell == trained
+    assert "ended with status" in failure.message
+    assert "nowhere" in failure.log.read_text()
+    assert (store.state(trained), store.state(one)) == ("failed", "waiting")
+
+
+def test_a_training_that_outlives_its_command_keeps_others_out(store):
+    """The lock is held as long as a process has its descriptor, and freed when the last one is killed."""
+    with store.lock(cell()) as descriptor:
+        orphan = subprocess.Popen([sys.executable, "-c", "input()"], pass_fds=(descriptor,), stdin=-1)
+    waiting = (
+        "import sys; from pathlib import Path; from lerobot_swr.reproduction.cells import *\n"
+        "with Store(Path(sys.argv[1])).lock(Cell('similarity', Labels('data', '', 'similarity'), {})): print('in')"
+    )
+    other = subprocess.Popen([sys.executable, "-c", waiting, store.root], stdout=-1, text=True)
+    with pytest.raises(subprocess.TimeoutExpired):
+        other.wait(timeout=2)
+    os.kill(orphan.pid, signal.SIGKILL)
+    orphan.wait()
+    assert other.communicate(timeout=60)[0] == "in\n"
+
+
+def test_every_style_is_used_equally_often(settings, demos):
+    """Stratified rollouts are a multiple of the demonstrations, unless there are more of these."""
+    for n_rollouts, expected in ((12, 12), (17, 12), (5, 5)):
+        changed = dataclasses.replace(settings, n_rollouts=n_rollouts)
+        one = evaluation(changed, demos, training(changed, demos, "zbc"), "x")
+        assert one.definition["protocols"] == {"uniform": n_rollouts, "stratified": expected}
+
+
+def test_policies_without_styles_are_rolled_out_once(settings, demos):
+    """There is nothing to stratify."""
+    one = evaluation(settings, demos, training(settings, demos, "bc"), "x")
+    assert one.definition["protocols"] == {"uniform": 12}
+
+
+def test_the_recipes_of_other_policies_are_those_of_the_configs():
+    """configs/ and the suites train the same networks."""
+    import yaml
+
+    configs = Path(__file__).parent.parent / "configs"
+    for name, baseline in BASELINES.items():
+        if name not in known_policies():
+            continue
+        recipe = yaml.safe_load((configs / f"{name}.yaml").read_text())
+        written = {k: v for k, v in recipe["policy"].items() if k not in ("type", "device", "push_to_hub")}
+        assert written == baseline.options, name
+        assert recipe["batch_size"] == baseline.batch_size, name
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"suite": "table9"}, r"suite='table9': expected one of table1, "),
+        ({"seeds": 0}, r"seeds=0: expected at least 1"),
+        ({"policies": []}, r"policies=\[\]: nothing would be left"),
+        ({"jobs": 0}, r"jobs=0"),
+    ],
+)
+def test_bad_settings_are_named(options, message):
+    """Before anything is made."""
+    with pytest.raises(ValueError, match=message):
+        ReproductionSettings(**options)
+
+
+def test_unknown_datasets_and_policies_are_named(tmp_path):
+    """With what there is instead."""
+    with pytest.raises(ValueError, match=r"'maze9' is neither in .* nor one of the package's: medium_maze"):
+        execution.reproduce(ReproductionSettings(suite="table1", datasets=["maze9"], output_dir=tmp_path))
+    with pytest.raises(ValueError, match=r"policies=\['zcb'\]: unknown; this installation knows bc, zbc"):
+        execution.reproduce(ReproductionSettings(policies=["zcb"], output_dir=tmp_path))
+
+
+def test_the_whole_suite_from_the_command(small_maze, tmp_path, run_command, capsys):
+    """Train, measure, report; a second call finds everything done and draws the same report."""
+    from lerobot_swr.cli.report import main as report
+    from lerobot_swr.cli.reproduce import main as reproduce
+
+    flags = [
+        "--suite=table1",
+        f"--datasets=[{small_maze.name}]",
+        f"--dataset_dir={small_maze.parent}",
+        "--policies=[zbc]",
+        "--steps=20",
+        "--seeds=2",
+        "--n_rollouts=6",
+        "--policy_options={hidden_dim: 16, num_hidden: 2}",
+        f"--output_dir={tmp_path}",
+        "--jobs=1",
+    ]
+    run_command(reproduce, *flags)
+    assert "2 done, 0 failed, 0 waiting" in capsys.readouterr().out
+    results = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
+    [evaluated] = [json.loads(p.read_text()) for p in results if p.name.startswith("evaluate")]
+    assert [len(seed["stratified"]["behavior"]) for seed in evaluated["result"]["rollouts"].values()] == [6, 6]
+    page = (tmp_path / "report.html").read_bytes()
+    run_command(reproduce, *flags)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()} == results
+    assert (tmp_path / "report.html").read_bytes().count(b"<img") == page.count(b"<img") == 2
+    again = (tmp_path / "report.html").read_bytes()
+    run_command(report, tmp_path)
+    assert (tmp_path / "report.html").read_bytes() == again
