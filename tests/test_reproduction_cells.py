@@ -68,7 +68,13 @@ def test_what_defines_a_cell_is_its_identity():
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("steps", 21), ("seeds", 3), ("batch_size", 8), ("policy_options", {"hidden_dim": 17}), ("n_rollouts", 9)],
+    [
+        ("steps", 21),
+        ("seeds", 3),
+        ("batch_size", 8),
+        ("policy_options", {"hidden_dim": 17}),
+        ("n_rollouts", 9),
+    ],
 )
 def test_a_changed_setting_is_a_new_cell(settings, demos, key, value):
     """Each setting reaches the key of what is measured."""
@@ -270,7 +276,10 @@ def test_the_whole_suite_from_the_command(small_maze, tmp_path, run_command, cap
     assert "2 done, 0 failed, 0 waiting" in capsys.readouterr().out
     results = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()}
     [evaluated] = [json.loads(p.read_text()) for p in results if p.name.startswith("evaluate")]
-    assert [len(seed["stratified"]["behavior"]) for seed in evaluated["result"]["rollouts"].values()] == [6, 6]
+    assert [len(seed["stratified"]["behavior"]) for seed in evaluated["result"]["rollouts"].values()] == [
+        6,
+        6,
+    ]
     page = (tmp_path / "report.html").read_bytes()
     run_command(reproduce, *flags)
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "results").iterdir()} == results

@@ -29,13 +29,16 @@ SpeedRule = Callable[[np.random.Generator, float], float]
 """Draws the mean speed of one demonstration (side lengths per step) given the length of its path."""
 
 
-def forward_path(checkpoints: str, layout: MazeLayout, rng: np.random.Generator) -> np.ndarray:
+def forward_path(
+    checkpoints: str, layout: MazeLayout, rng: np.random.Generator, path_spread: float = PATH_SPREAD
+) -> np.ndarray:
     """A smooth path from the start through one door of every wall to the goal.
 
     Args:
         checkpoints: Behaviour label, one door per wall, e.g. ``"6410"``.
         layout: The maze.
         rng: Source of the variation.
+        path_spread: Standard deviation of the free points between the walls.
 
     Returns:
         (P, 2) densely spaced points; y grows strictly, so no wall is crossed outside its door.
@@ -52,14 +55,16 @@ def forward_path(checkpoints: str, layout: MazeLayout, rng: np.random.Generator)
     for before, after in pairwise(points):
         share = rng.uniform(0.35, 0.65)
         free = before + share * (after - before)
-        free[0] = np.clip(free[0] + PATH_SPREAD * rng.standard_normal(), 0.03, 0.97)
+        free[0] = np.clip(free[0] + path_spread * rng.standard_normal(), 0.03, 0.97)
         with_free_points += [free, after]
     x, y = np.array(with_free_points).T
     dense_y = np.linspace(y[0], y[-1], 2000)
     return np.stack([PchipInterpolator(y, x)(dense_y), dense_y], axis=1)
 
 
-def walk(path: np.ndarray, speed: float, task: str, rng: np.random.Generator) -> Demonstration:
+def walk(
+    path: np.ndarray, speed: float, task: str, rng: np.random.Generator, speed_wobble: float = SPEED_WOBBLE
+) -> Demonstration:
     """Follow a path in the environment.
 
     Args:
@@ -67,6 +72,7 @@ def walk(path: np.ndarray, speed: float, task: str, rng: np.random.Generator) ->
         speed: Mean speed, in side lengths per step.
         task: Name of the maze.
         rng: Source of the variation.
+        speed_wobble: Relative standard deviation of the speed along the way.
 
     Returns:
         The demonstration; its last `FRAMES_AT_GOAL` frames lie in the goal disc.
@@ -83,7 +89,7 @@ def walk(path: np.ndarray, speed: float, task: str, rng: np.random.Generator) ->
     for _ in range(20 * int(arc[-1] / speed)):
         wobble = MEMORY * wobble + fresh * rng.standard_normal()
         tremor = MEMORY * tremor + fresh * rng.standard_normal(2)
-        pace = speed * max(0.3, 1 + SPEED_WOBBLE * wobble)
+        pace = speed * max(0.3, 1 + speed_wobble * wobble)
 
         near = (arc >= progress - 3 * speed) & (arc <= progress + 3 * speed)
         progress = arc[near][np.linalg.norm(path[near] - position, axis=1).argmin()]
@@ -119,23 +125,37 @@ def spread_lengths(rng: np.random.Generator, path_length: float) -> float:
     return path_length / rng.uniform(62, 107)
 
 
-def demonstrate(task: str, behaviors: Sequence[str], speed: SpeedRule, seed: int) -> Iterator[Demonstration]:
+def even(rng: np.random.Generator, path_length: float) -> float:
+    """Nearly the same speed in every episode."""
+    return 0.018 * (1 + 0.01 * rng.standard_normal())
+
+
+def demonstrate(
+    task: str,
+    behaviors: Sequence[str],
+    speed: SpeedRule,
+    seed: int,
+    path_spread: float = PATH_SPREAD,
+    speed_wobble: float = SPEED_WOBBLE,
+) -> Iterator[Demonstration]:
     """One demonstration per entry of `behaviors`, in an order shuffled by the seed."""
     rng = np.random.default_rng(seed)
     layout = get_layout(task)
     rule = MazeBehaviorRule(layout)
     for behavior in rng.permutation(np.array(behaviors)):
         while True:
-            path = forward_path(behavior, layout, rng)
+            path = forward_path(behavior, layout, rng, path_spread)
             path_length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-            demonstration = walk(path, speed(rng, path_length), task, rng)
+            demonstration = walk(path, speed(rng, path_length), task, rng, speed_wobble)
             # Hand tremor near a door's edge can, rarely, miss the door: such a recording is thrown away.
             if rule(demonstration.observations) == behavior:
                 break
         yield demonstration
 
 
-def _recipe(name: str, task: str, counts: dict[str, int], speed: SpeedRule) -> DatasetRecipe:
+def _recipe(
+    name: str, task: str, counts: dict[str, int], speed: SpeedRule, **variation: float
+) -> DatasetRecipe:
     behaviors = [behavior for behavior, count in counts.items() for _ in range(count)]
     return DatasetRecipe(
         name=name,
@@ -148,7 +168,7 @@ def _recipe(name: str, task: str, counts: dict[str, int], speed: SpeedRule) -> D
             "action": ("dx", "dy"),
         },
         n_episodes=len(behaviors),
-        demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed),
+        demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed, **variation),
         behavior_rule=MazeBehaviorRule(get_layout(task)),
     )
 
@@ -177,5 +197,14 @@ MAZE_RECIPES = (
         "medium",
         {"6410": 25, "7420": 25, "6310": 25, "7520": 25},
         spread_lengths,
+    ),
+    # one_side by another demonstrator: paths spread twice as far between the walls, at an even pace.
+    _recipe(
+        "medium_maze-spread_out",
+        "medium",
+        {"6410": 50, "7420": 50},
+        even,
+        path_spread=2 * PATH_SPREAD,
+        speed_wobble=0.02,
     ),
 )
