@@ -158,6 +158,11 @@ class StepGenerator(nn.Module):
         self.step += 1
         return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint32)[0]))
 
+    def uniforms(self, steps: int, count: int) -> Tensor:
+        """(steps * count,) numbers in [0, 1), `count` from the generator of each of the next steps."""
+        drawn = [torch.rand(count, generator=self.next(), dtype=torch.float64) for _ in range(steps)]
+        return torch.cat(drawn)
+
 
 def check_probability(p: float) -> None:
     """Refuse what is no probability.

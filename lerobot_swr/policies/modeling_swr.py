@@ -94,11 +94,12 @@ class BCPolicy(DatasetPolicy):
         figures = self.figures(drawn, losses.detach()) if self.training else {}
         return (losses if reduction == "none" else losses.mean()), figures
 
-    def draw(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
         """What the loss of a batch is computed from, all random draws and bookkeeping included.
 
         Args:
-            batch: As in `forward`.
+            batch: As in `forward`; the frames of consecutive steps may come together, one after the other.
+            steps: Number of steps whose frames these are, as many of each.
 
         Returns:
             Observations (B, d_k), ``action`` (B, A) and ``weight`` (B,), the factor of each frame's loss.
@@ -186,13 +187,13 @@ class ZBCPolicy(BCPolicy):
             {"params": list(self.styles.parameters()), "lr": rate},
         ]
 
-    def draw(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
         """As `BCPolicy.draw`, with the style of each frame.
 
         That is ``style_episode`` (B,), the episode whose style it is, in training; in evaluation, where an
         episode may not have been trained on, the ``style`` (B, style_dim) itself.
         """
-        drawn, episodes = super().draw(batch), batch["episode_index"]
+        drawn, episodes = super().draw(batch, steps), batch["episode_index"]
         if not self.training:
             return {**drawn, "style": self.held_out.styles(episodes)}
         self.styles.mark_trained(episodes)
@@ -360,33 +361,29 @@ class WZBCPolicy(ZBCPolicy):
             raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
         return keys
 
-    def draw(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
         """As `ZBCPolicy.draw`, with the pair of each frame: its style may be another episode's.
 
         ``relabelled`` (B,) is True where it is. The mean loss has algorithm 1's expectation.
-        """
-        if not self.training:
-            return super().draw(batch)
-        episodes = batch["episode_index"]
-        self.styles.mark_trained(episodes)
-        uniforms = torch.rand(len(episodes), generator=self.draws.next(), dtype=torch.float64)
-        return self.draw_pairs(BCPolicy.draw(self, batch), episodes, uniforms)
-
-    def draw_pairs(self, drawn: dict[str, Tensor], episodes: Tensor, uniforms: Tensor) -> dict[str, Tensor]:
-        """Complete what `BCPolicy.draw` returned for frames of any number of steps.
-
-        Args:
-            drawn: Observations, action and weight of (B,) frames.
-            episodes: (B,) episode of each.
-            uniforms: (B,) independent numbers in [0, 1).
 
         Raises:
-            RuntimeError: If the policy was created without a dataset.
+            RuntimeError: In training, if the policy was created without a dataset.
         """
+        if not self.training:
+            return super().draw(batch, steps)
+        episodes = batch["episode_index"]
+        if steps > 1 and not self.styles.trained[episodes].all():
+            # Partners are episodes seen so far, which differ from step to step.
+            split = [{k: v.unflatten(0, (steps, -1))[s] for k, v in batch.items()} for s in range(steps)]
+            parts = [self.draw(one) for one in split]
+            return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         if self.sampler is None:
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
+        self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
-        pairs = self.sampler.draw(episodes, uniforms.to(episodes.device))
+        uniforms = self.draws.uniforms(steps, len(episodes) // steps).to(episodes.device)
+        pairs = self.sampler.draw(episodes, uniforms)
+        drawn = BCPolicy.draw(self, batch, steps)
         weight = drawn["weight"] * pairs.weights
         return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
 
