@@ -381,8 +381,7 @@ class WZBCPolicy(ZBCPolicy):
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
         self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
-        uniforms = self.draws.uniforms(steps, len(episodes) // steps).to(episodes.device)
-        pairs = self.sampler.draw(episodes, uniforms)
+        pairs = self.sampler.draw(episodes, self.draws.uniforms(steps, len(episodes) // steps))
         drawn = BCPolicy.draw(self, batch, steps)
         weight = drawn["weight"] * pairs.weights
         return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
@@ -406,10 +405,12 @@ class WZBCPolicy(ZBCPolicy):
         assert self.sampler is not None
         p, figures = self.config.p, {"effective_demos": self.sampler.effective_demos}
         # NumPy: torch's overhead for so few numbers would be noticeable in every step.
-        relabelled = drawn["relabelled"].cpu().numpy()
+        values, weights = losses.cpu().numpy(), drawn["weight"].cpu().numpy()
+        share = drawn["relabelled"].cpu().numpy() / np.float32(len(values))
+        relabelled = float(values @ share)
         if p < 1:
-            figures["own_style_loss"] = float((losses.cpu().numpy() * ~relabelled).mean()) / (1 - p)
+            figures["own_style_loss"] = (float(values.mean()) - relabelled) / (1 - p)
         if p > 0:
-            figures["relabelled_loss"] = float((losses.cpu().numpy() * relabelled).mean()) / p
-            figures["mean_weight"] = float((drawn["weight"].cpu().numpy() * relabelled).mean()) / p
+            figures["relabelled_loss"] = relabelled / p
+            figures["mean_weight"] = float(weights @ share) / p
         return figures
