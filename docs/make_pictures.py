@@ -21,8 +21,8 @@ def main() -> None:
     maze = draw_maze(get_layout("medium"), 320)
     Image.fromarray(draw_episode(maze, walk[:60])).save(IMAGES / "maze_medium.png")
 
-    figure = Figure(figsize=(10, 3.8), layout="constrained")
-    for axes, recipe in zip(figure.subplots(1, 3), MAZE_RECIPES, strict=True):
+    figure = Figure(figsize=(13, 3.8), layout="constrained")
+    for axes, recipe in zip(figure.subplots(1, len(MAZE_RECIPES)), MAZE_RECIPES, strict=True):
         episodes = [demonstration.observations for demonstration in recipe.demonstrations(0)]
         paths = [(episode["observation.state"], recipe.behavior_rule(episode)) for episode in episodes]
         colors = behavior_colors(sorted({label for _, label in paths}))

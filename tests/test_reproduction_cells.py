@@ -8,8 +8,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import draccus
 import pytest
 from conftest import save_checkpoint
+from lerobot.configs import PreTrainedConfig
+from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_swr.reproduction import execution, measurement
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
@@ -18,6 +21,8 @@ from lerobot_swr.reproduction.execution import format_states, run_cells, run_cha
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.suites import BASELINES, evaluation, known_policies, suite_cells, training
 from lerobot_swr.reproduction.training import checkpoint_folder
+
+CONFIGS = Path(__file__).parent.parent / "configs"
 
 
 def cell(**definition) -> Cell:
@@ -47,7 +52,7 @@ def settings(tmp_path) -> ReproductionSettings:
 
 @pytest.fixture
 def trained(settings, demos, store, make_tiny_policy, small_maze_meta) -> Cell:
-    """A finished training cell of zbc; its policies are fresh ones, all of their styles marked as trained."""
+    """A finished training cell of zbc; its policies are fresh, all of their styles marked as trained."""
     one = training(settings, demos, "zbc")
     for seed in one.definition["seeds"]:
         policy = make_tiny_policy("zbc", seed=seed)
@@ -58,7 +63,7 @@ def trained(settings, demos, store, make_tiny_policy, small_maze_meta) -> Cell:
 
 
 def test_what_defines_a_cell_is_its_identity():
-    """The same definition is the same cell whatever it is called and however it is ordered; others are not."""
+    """The same definition is the same cell, whatever its name and order; another one is another cell."""
     one = cell(a=1, b=[2])
     assert Cell("similarity", Labels("other", "x", "y"), {"b": [2], "a": 1}).key == one.key
     others = [cell(a=1), cell(a=1, b=[3]), Cell("styles", one.labels, one.definition)]
@@ -192,10 +197,13 @@ def test_a_training_that_outlives_its_command_keeps_others_out(store):
     """The lock is held as long as a process has its descriptor, and freed when the last one is killed."""
     with store.lock(cell()) as descriptor:
         orphan = subprocess.Popen([sys.executable, "-c", "input()"], pass_fds=(descriptor,), stdin=-1)
-    waiting = (
-        "import sys; from pathlib import Path; from lerobot_swr.reproduction.cells import *\n"
-        "with Store(Path(sys.argv[1])).lock(Cell('similarity', Labels('data', '', 'similarity'), {})): print('in')"
-    )
+    waiting = """if True:
+        import sys
+        from pathlib import Path
+        from lerobot_swr.reproduction.cells import Cell, Labels, Store
+        with Store(Path(sys.argv[1])).lock(Cell("similarity", Labels("data", "", "similarity"), {})):
+            print("in")
+    """
     other = subprocess.Popen([sys.executable, "-c", waiting, store.root], stdout=-1, text=True)
     with pytest.raises(subprocess.TimeoutExpired):
         other.wait(timeout=2)
@@ -218,18 +226,16 @@ def test_policies_without_styles_are_rolled_out_once(settings, demos):
     assert one.definition["protocols"] == {"uniform": 12}
 
 
-def test_the_recipes_of_other_policies_are_those_of_the_configs():
-    """configs/ and the suites train the same networks."""
-    import yaml
-
-    configs = Path(__file__).parent.parent / "configs"
-    for name, baseline in BASELINES.items():
-        if name not in known_policies():
-            continue
-        recipe = yaml.safe_load((configs / f"{name}.yaml").read_text())
-        written = {k: v for k, v in recipe["policy"].items() if k not in ("type", "device", "push_to_hub")}
-        assert written == baseline.options, name
-        assert recipe["batch_size"] == baseline.batch_size, name
+@pytest.mark.parametrize("name", [name for name in BASELINES if name in known_policies()])
+def test_the_recipes_of_other_policies_are_those_of_the_configs(name):
+    """configs/ and the suites train the same networks on batches of the same size."""
+    recipe = TrainPipelineConfig.from_pretrained(CONFIGS / f"{name}.yaml")
+    config = PreTrainedConfig.get_choice_class(name)(
+        device="cpu", push_to_hub=False, **BASELINES[name].options
+    )
+    encoded = [draccus.encode(c, PreTrainedConfig) for c in (config, recipe.policy)]
+    assert encoded[0] == encoded[1]
+    assert recipe.batch_size == BASELINES[name].batch_size
 
 
 @pytest.mark.parametrize(

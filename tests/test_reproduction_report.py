@@ -119,7 +119,6 @@ def test_summaries_hold_the_numbers_of_the_tables(finished):
 
 def test_published_results_give_the_same_report_without_checkpoints(finished, tmp_path):
     """Copied, the small files are enough; what an earlier publication left there goes."""
-    (finished / "work").mkdir()
     (finished / "work" / "big").write_text("checkpoint")
     target = tmp_path / "published"
     write_text(target / "results" / "stale.json", "{}")

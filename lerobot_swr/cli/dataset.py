@@ -21,7 +21,8 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 class DatasetCommand:
     """Options of ``lerobot-swr-dataset``."""
 
-    # Which dataset: medium_maze-one_side, medium_maze-only_forward or medium_maze-only_fast;
+    # Which dataset: medium_maze-one_side, medium_maze-only_forward, medium_maze-only_fast or
+    # medium_maze-spread_out;
     # d3il_avoiding, d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning.
     # With from_d3il: avoiding or aligning.
     task: str

@@ -31,14 +31,14 @@ class Demonstrations:
         root: Its folder.
         fingerprint: Hash of its observations and actions.
         env: Options of its environment, ``type`` and ``task`` among them.
-        count: Number of demonstrations.
+        lengths: Frames of each demonstration.
     """
 
     name: str
     root: Path
     fingerprint: str
     env: dict[str, Any]
-    count: int
+    lengths: tuple[int, ...]
 
     @property
     def cell(self) -> Cell:
@@ -74,9 +74,8 @@ def prepare(name: str, folder: Path, store: Store) -> Demonstrations:
     trajectories = load_low_dimensional(root)
     env_type, task = meta.robot_type.split("_", 1)
     fingerprint = trajectories.fingerprint(sorted(trajectories.columns))
-    demonstrations = Demonstrations(
-        name, root, fingerprint, {"type": env_type, "task": task}, len(trajectories)
-    )
+    lengths = tuple(trajectories.lengths.tolist())
+    demonstrations = Demonstrations(name, root, fingerprint, {"type": env_type, "task": task}, lengths)
     if not store.is_done(demonstrations.cell):
         store.write(demonstrations.cell, _describe(trajectories, environment(demonstrations.env)), 0.0)
     return demonstrations

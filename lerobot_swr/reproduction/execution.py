@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
@@ -155,6 +156,8 @@ def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
 
 
 def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:
+    # Cells share the cores among them; and another number of threads would change the rounding.
+    torch.set_num_threads(1)
     if cell.kind == "train":
         return train(cell, store, dataset, lock)
     if cell.kind == "evaluate":

@@ -29,7 +29,7 @@ class ReproductionSettings:
     # seed after the other.
     act_steps: int = 10_000
     diffusion_steps: int = 10_000
-    baseline_steps: int = 10_000
+    baseline_steps: int = 20_000
     baseline_seeds: int = 2
     # Only these datasets; null takes the paper's. A suite that is named takes datasets of your own as well.
     datasets: list[str] | None = None
