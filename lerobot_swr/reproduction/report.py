@@ -10,7 +10,7 @@ from lerobot_swr.evaluation.report import Picture, Section, write_report
 from lerobot_swr.reproduction import figures, tables
 from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.paper import SOURCE
-from lerobot_swr.reproduction.stored_results import SuiteResults, load_suites
+from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults, load_suites
 
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
@@ -102,10 +102,14 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             continue
         curves = pictures / f"robustness-{name}.png"
         figures.plot_perturbations(curves, cells)
-        why = [tables.teaching(cell) for cell in suite.of_kind("similarity", name)]
+        teaching = suite.of_kind("similarity", name)
         yield Section(
             f"Robustness: {name}",
-            [tables.robustness(suite, name), tables.robustness_differences(suite, name), *why],
+            [
+                tables.robustness(suite, name),
+                tables.robustness_differences(suite, name),
+                *map(tables.teaching, teaching),
+            ],
             [
                 Picture(
                     "Success, style match and L1 over the half-width of the square of starts (top) and the "
@@ -114,12 +118,17 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
                     curves,
                 )
             ],
-            [
-                "WZBC can differ from ZBC only as far as other demonstrations teach a style. The last table "
-                "says how far that is: with the paper's β and p, a style's own demonstration carries most of "
-                "its weight here."
-            ],
+            [_who_teaches(cell) for cell in teaching],
         )
+
+
+def _who_teaches(cell: StoredCell) -> str:
+    paper = cell.result["shares"][0]
+    return (
+        "WZBC can differ from ZBC only as far as other demonstrations teach a style (last table): with "
+        f"β = {paper['beta']:g} and p = {paper['p']:g}, a style's own demonstration carries "
+        f"{paper['own']:.0%} of its weight here, others of the same behaviour {paper['same']:.0%}."
+    )
 
 
 def _control(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
