@@ -2,6 +2,8 @@
 
 import json
 import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,12 +11,18 @@ import pytest
 from lerobot_swr.cli.report import main as report_command
 from lerobot_swr.evaluation.behavior_evaluation import path_of
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
-from lerobot_swr.reproduction.demonstrations import environment, prepare, short_path
+from lerobot_swr.reproduction.demonstrations import (
+    environment,
+    load_low_dimensional,
+    prepare,
+    short_path,
+)
 from lerobot_swr.reproduction.execution import run_cells
-from lerobot_swr.reproduction.publication import END, START, publish, readme_block, with_block
+from lerobot_swr.reproduction.publication import END, START, publish, readme_block, update_readme, with_block
 from lerobot_swr.reproduction.report import write_results_report
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.stored_results import load_suites
+from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.trajectories import Trajectories
 
 REPOSITORY = Path(__file__).parent.parent
@@ -38,25 +46,35 @@ def invented_result(one: Cell, lengths: list[int], behaviors: list[str], paths: 
     return {"rollouts": rollouts, "allowed": None, "paths": drawn}
 
 
-@pytest.fixture
-def finished(tmp_path, small_maze, small_maze_meta, monkeypatch) -> Path:
-    """All suites on the small maze, as if perfect reproducers had been trained."""
-    from lerobot_swr.reproduction import suites
-    from lerobot_swr.reproduction.demonstrations import load_low_dimensional
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory, small_maze) -> Iterator[Path]:
+    """All suites on the small maze, as if perfect reproducers had been trained, and their report."""
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        root = tmp_path_factory.mktemp("reproduction") / "finished"
+        _finish(root, small_maze, monkeypatch)
+        write_results_report(root)
+        yield root
 
-    store = Store(tmp_path / "finished")
+
+@pytest.fixture
+def finished(drawn, tmp_path) -> Path:
+    """A copy of it."""
+    return Path(shutil.copytree(drawn, tmp_path / "finished"))
+
+
+def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = Store(root)
     demos = prepare(small_maze.name, small_maze.parent, store)
     settings = ReproductionSettings(seeds=2, n_rollouts=12, sweep_seeds=1, output_dir=store.root)
     trajectories: Trajectories = load_low_dimensional(small_maze)
     env_cfg = environment(demos.env)
     behaviors = [env_cfg.behavior_rule()(episode) for episode in trajectories.episodes()]
     lengths = trajectories.lengths.tolist()
-    monkeypatch.setattr("lerobot_swr.reproduction.suites.LENGTH_BAND", (min(lengths), max(lengths)))
-    for module in ("tables", "figures"):
+    for module in ("suites", "tables", "figures"):
         monkeypatch.setattr(f"lerobot_swr.reproduction.{module}.LENGTH_BAND", (min(lengths), max(lengths)))
     paths = [short_path(path_of(env_cfg, episode)) for episode in trajectories.episodes()]
     for suite in ("table1", "robustness", "control", "figures"):
-        cells = suites.suite_cells(suite, settings, [demos])
+        cells = suite_cells(suite, settings, [demos])
         for one in cells:
             if one.kind == "similarity":
                 assert run_cells([one], store, {demos.name: demos}, jobs=1) == []
@@ -73,29 +91,30 @@ def finished(tmp_path, small_maze, small_maze_meta, monkeypatch) -> Path:
             "cells": [store.result_path(one).name for one in cells],
         }
         write_text(store.root / "suites" / f"{suite}.json", json.dumps(manifest))
-    return store.root
 
 
-def test_the_report_shows_every_suite_and_needs_no_other_file(finished):
+def test_the_report_shows_every_suite_and_needs_no_other_file(drawn):
     """Tables, captioned pictures inside the page, commands and versions."""
-    page = write_results_report(finished).read_text()
+    page = (drawn / "report.html").read_text()
     for heading in ("Diversity", "Robustness", "Control", "Similarity and styles", "How this was made"):
         assert f"<h2>{heading}" in page
     assert "Not finished" not in page
     assert page.count("<figcaption>") == page.count('<img src="data:image/png;base64,') >= 8
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
-    for suite in load_suites(finished):
+    for suite in load_suites(drawn):
         assert f"lerobot-swr-reproduce --suite={suite}" in page
     assert "lerobot 0.6" in page
 
 
-def test_drawing_again_changes_nothing(finished):
+def test_drawing_again_changes_nothing(drawn):
     """The same stored results give the same files, byte for byte."""
-    write_results_report(finished)
-    files = [path for path in finished.rglob("*") if path.is_file()]
-    before = {path: path.read_bytes() for path in files}
-    write_results_report(finished)
-    assert {path: path.read_bytes() for path in finished.rglob("*") if path.is_file()} == before
+
+    def files() -> dict[Path, bytes]:
+        return {path: path.read_bytes() for path in drawn.rglob("*") if path.is_file()}
+
+    before = files()
+    write_results_report(drawn)
+    assert files() == before
 
 
 def test_the_report_says_what_is_missing(finished):
@@ -107,10 +126,9 @@ def test_the_report_says_what_is_missing(finished):
     assert lost.name in page
 
 
-def test_summaries_hold_the_numbers_of_the_tables(finished):
+def test_summaries_hold_the_numbers_of_the_tables(drawn):
     """A perfect reproducer's stratified L1 is 0 in the file for other programs, too."""
-    write_results_report(finished)
-    rows = json.loads((finished / "summaries.json").read_text())
+    rows = json.loads((drawn / "summaries.json").read_text())
     stratified = [row for row in rows if row["protocol"] == "stratified" and row["policy"] == "zbc"]
     assert stratified
     assert all(row["l1"] == 0 and row["success"]["mean"] == 1 for row in stratified)
@@ -131,15 +149,15 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     assert pages[0] == pages[1]
 
 
-def test_the_command_fills_the_readme_block(finished, tmp_path, run_command):
+def test_the_readme_block_is_filled(finished, tmp_path):
     """Between the markers stands the table, everything else is kept; a second time changes nothing."""
     readme = tmp_path / "README.md"
     readme.write_text(f"before\n{START}\nold\n{END}\nafter\n")
-    run_command(report_command, finished, f"--readme={readme}")
+    update_readme(readme, finished)
     text = readme.read_text()
     assert text == f"before\n{START}\n\n{readme_block(finished)}\n\n{END}\nafter\n"
     assert "| small_maze | wzbc | 100,000 | 2 × 12 | 0.000 |" in text
-    run_command(report_command, finished, f"--readme={readme}")
+    update_readme(readme, finished)
     assert readme.read_text() == text
 
 

@@ -107,14 +107,14 @@ def l1_interval(labels_by_seed: Sequence[Sequence[str]], reference: Mapping[str,
     names = sorted({label for labels in labels_by_seed for label in labels} | set(reference))
     place = {label: i for i, label in enumerate(names)}
     reference_shares = np.array([reference.get(label, 0.0) for label in names])
-    shares = [
-        np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed
-    ]
-    scores = []
-    for _ in range(BOOTSTRAP_DRAWS):
-        chosen = rng.integers(len(shares), size=len(shares))
-        resampled = [rng.multinomial(c.sum(), c / c.sum()) / c.sum() for c in (shares[i] for i in chosen)]
-        scores.append(np.mean([np.abs(r - reference_shares).sum() for r in resampled]))
+    counts = np.stack(
+        [np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed]
+    )  # (seeds, labels)
+    totals = counts.sum(axis=1)
+    chosen = rng.integers(len(counts), size=(BOOTSTRAP_DRAWS, len(counts)))
+    resampled = rng.multinomial(totals[chosen], (counts / totals[:, None])[chosen])  # (draws, seeds, labels)
+    shares = resampled / totals[chosen][..., None]
+    scores = np.abs(shares - reference_shares).sum(axis=2).mean(axis=1)
     return Interval(*np.quantile(scores, [0.025, 0.975]).tolist())
 
 

@@ -21,7 +21,9 @@ from lerobot_swr.reproduction.measurement import measure
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
 from lerobot_swr.reproduction.suites import DATASETS, known_policies, suite_cells
-from lerobot_swr.reproduction.training import checkpoint_folder, steps_done, train
+from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done, train
+
+LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,10 @@ def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
 
     def work(chain: list[Cell]) -> int:
         root = chain[0]
-        return root.definition["steps"] * len(root.definition["seeds"]) if root.kind == "train" else 0
+        if root.kind != "train":
+            return 0
+        seed_steps = root.definition["steps"] * len(root.definition["seeds"])
+        return seed_steps if root.definition["policy"] in STACKED else LEROBOT_TRAIN_SLOWNESS * seed_steps
 
     return sorted(chains, key=work, reverse=True)
 

@@ -243,7 +243,7 @@ def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
     low, high = LENGTH_BAND
     if not any(low <= length <= high for length in demos.lengths):
         raise ValueError(
-            f"datasets: {demos.name!r} has no demonstration of {low} to {high} frames to control"
+            f"datasets: {demos.name!r} has no demonstration of {low} to {high} frames, which control needs"
         )
     for policy in settings.choose_policies(STACKED):
         trained = training(settings, demos, policy)
