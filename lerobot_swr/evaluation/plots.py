@@ -76,8 +76,8 @@ def plot_comparison(
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.3 * columns, 3.9 * rows), layout="constrained")
     colors = behavior_colors([label for paths in panels.values() for _, label in paths])
-    grid = figure.subplots(rows, columns, squeeze=False).flat
-    for axes, (name, paths) in zip(grid, panels.items(), strict=False):
+    grid = iter(figure.subplots(rows, columns, squeeze=False).flat)
+    for (name, paths), axes in zip(panels.items(), grid, strict=False):
         draw_paths(axes, paths, colors, env_cfg)
         axes.set_title(name)
     for axes in grid:  # those that are left over

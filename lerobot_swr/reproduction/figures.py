@@ -39,8 +39,8 @@ def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Seque
     columns = min(3, len(cells))
     rows = -(-len(cells) // columns)
     figure = Figure(figsize=(5.0 * columns, 3.3 * rows), layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False, sharey=True).flat
-    for axes, cell in zip(grid, cells, strict=False):
+    grid = iter(figure.subplots(rows, columns, squeeze=False, sharey=True).flat)
+    for cell, axes in zip(cells, grid, strict=False):
         summary = cell.best
         draw_histograms(axes, demonstrations.histogram, summary.histogram)
         axes.set_title(f"{cell.labels.policy}: L1 {summary.l1:.3f} ({summary.protocol})", fontsize=10)

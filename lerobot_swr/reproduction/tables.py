@@ -101,7 +101,7 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
 
 def robustness(suite: SuiteResults, dataset: str) -> Table:
     """Perturbed starts and transitions: the paper's Table 2."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for condition in CONDITIONS:
         for cell in suite.evaluations(dataset):
             if cell.labels.condition == condition:
@@ -143,26 +143,31 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
 def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
     """Every WZBC against ZBC under the same starts and noise."""
     cells = {(c.labels.policy, c.labels.condition): c for c in suite.evaluations(dataset)}
+    policies = [name for name in dict.fromkeys(name for name, _ in cells) if name.startswith("wzbc")]
     rows = []
-    for (policy, condition), cell in cells.items():
+    for condition in dict.fromkeys(condition for _, condition in cells):
         reference = cells.get(("zbc", condition))
-        if policy.startswith("wzbc") and reference is not None:
-            row = [condition, policy]
-            for column in (0, 1):
-                mean, interval = difference_interval(
-                    [outcomes[:, column] for outcomes in cell.best.outcomes],
-                    [outcomes[:, column] for outcomes in reference.best.outcomes],
-                )
-                clear = interval.low > 0 or interval.high < 0
-                row.append(f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}")
-            rows.append(row)
-    order = list(dict.fromkeys(condition for _, condition in cells))
-    rows.sort(key=lambda row: order.index(row[0]))
+        if reference is not None:
+            pairs = [(cells.get((policy, condition)), reference) for policy in policies]
+            rows.append((condition, *(_difference(*pair, column) for column in (0, 1) for pair in pairs)))
     caption = (
         f"{dataset}: WZBC minus ZBC, each style once [95 % bootstrap interval over seeds and rollouts; "
         "* it leaves out 0]."
     )
-    return Table(caption, ("condition", "policy", "success", "style match"), rows)
+    header = (
+        "condition",
+        *(f"{what}\n{policy}" for what in ("success", "style match") for policy in policies),
+    )
+    return Table(caption, header, rows)
+
+
+def _difference(cell: StoredCell | None, reference: StoredCell, column: int) -> str:
+    if cell is None:
+        return NOTHING
+    both = ([outcomes[:, column] for outcomes in c.best.outcomes] for c in (cell, reference))
+    mean, interval = difference_interval(*both)
+    clear = interval.low > 0 or interval.high < 0
+    return f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}"
 
 
 def teaching(cell: StoredCell) -> Table:
