@@ -164,8 +164,8 @@ def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
 def _difference(cell: StoredCell | None, reference: StoredCell, column: int) -> str:
     if cell is None:
         return NOTHING
-    both = ([outcomes[:, column] for outcomes in c.best.outcomes] for c in (cell, reference))
-    mean, interval = difference_interval(*both)
+    first, second = ([outcomes[:, column] for outcomes in c.best.outcomes] for c in (cell, reference))
+    mean, interval = difference_interval(first, second)
     clear = interval.low > 0 or interval.high < 0
     return f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}"
 
