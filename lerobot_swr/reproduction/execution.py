@@ -20,7 +20,7 @@ from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
-from lerobot_swr.reproduction.suites import DATASETS, known_policies, suite_cells
+from lerobot_swr.reproduction.suites import DATASETS, known_policies, missing_extras, suite_cells
 from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done, train
 
 LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
@@ -57,6 +57,8 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
     Raises:
         ValueError: If a dataset or policy is unknown, or nothing is left to run.
     """
+    for name, extra in missing_extras().items():
+        print(f"left out: {name} (pip install '{extra}')")
     _check_policies(settings)
     store = Store(settings.output_dir)
     suites = {name: settings.choose_datasets(DATASETS[name]) for name in settings.suites}

@@ -1,5 +1,6 @@
 """The paper's experiments as lists of cells: what is compared is fixed here, before any training."""
 
+import importlib.util
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -64,11 +65,13 @@ class Baseline:
         options: What differs from its defaults: networks that a CPU trains, as in ``configs/``.
         batch_size: Frames per step.
         steps: Name of the setting that holds its steps.
+        extra: What installs ``diffusers``, without which it cannot be trained; None does not need it.
     """
 
     options: Mapping[str, Any]
     batch_size: int
     steps: str = "baseline_steps"
+    extra: str | None = "lerobot_policy_swr[baselines]"
 
 
 BASELINES = {
@@ -87,6 +90,7 @@ BASELINES = {
         },
         batch_size=32,
         steps="act_steps",
+        extra=None,
     ),
     "diffusion": Baseline(
         {
@@ -103,6 +107,7 @@ BASELINES = {
         },
         batch_size=64,
         steps="diffusion_steps",
+        extra="lerobot[diffusion]",
     ),
     "beso": Baseline({"lr_schedule": "cosine"}, batch_size=16),
     "ddpm_gpt": Baseline({"lr_schedule": "cosine"}, batch_size=16),
@@ -112,8 +117,19 @@ BASELINES = {
 
 def known_policies() -> tuple[str, ...]:
     """Policies that this installation can train."""
-    registered = PreTrainedConfig.get_known_choices()
-    return tuple(name for name in (*STACKED, *BASELINES) if name in registered)
+    missing = missing_extras()
+    return tuple(name for name in (*STACKED, *BASELINES) if _is_registered(name) and name not in missing)
+
+
+def missing_extras() -> dict[str, str]:
+    """Policies that cannot be trained for want of an optional package, and what to install."""
+    if importlib.util.find_spec("diffusers") is not None:
+        return {}
+    return {name: b.extra for name, b in BASELINES.items() if b.extra is not None and _is_registered(name)}
+
+
+def _is_registered(policy: str) -> bool:
+    return policy in PreTrainedConfig.get_known_choices()
 
 
 def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[Demonstrations]) -> list[Cell]:
