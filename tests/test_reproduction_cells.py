@@ -15,11 +15,12 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_swr.reproduction import execution, measurement
+from lerobot_swr.reproduction.baselines import BASELINES, known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
 from lerobot_swr.reproduction.settings import ReproductionSettings
-from lerobot_swr.reproduction.suites import BASELINES, evaluation, known_policies, suite_cells, training
+from lerobot_swr.reproduction.suites import evaluation, suite_cells, training
 from lerobot_swr.reproduction.training import checkpoint_folder
 
 CONFIGS = Path(__file__).parent.parent / "configs"

@@ -15,12 +15,13 @@ import torch
 from joblib import Parallel, delayed
 from tqdm import tqdm
 
+from lerobot_swr.reproduction.baselines import known_policies, missing_extras
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
-from lerobot_swr.reproduction.suites import DATASETS, known_policies, missing_extras, suite_cells
+from lerobot_swr.reproduction.suites import DATASETS, suite_cells
 from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done, train
 
 LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
@@ -221,13 +222,13 @@ def _write_manifest(
 def _progress(cells: Sequence[Cell], store: Store) -> Iterator[None]:
     """A bar over the cells, fed from what they have written, whoever computes them."""
     finished = threading.Event()
-    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout, mininterval=0) as bar:
+    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout) as bar:
 
         def watch() -> None:
             while True:
                 last = finished.wait(2.0)
-                done = sum(_share_done(cell, store) for cell in cells)
-                bar.update(round(done, 2) - bar.n)
+                bar.n = round(sum(_share_done(cell, store) for cell in cells), 1)
+                bar.refresh()
                 if last:
                     return
 
