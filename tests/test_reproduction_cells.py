@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import draccus
@@ -294,3 +295,36 @@ def test_the_whole_suite_from_the_command(small_maze, tmp_path, run_command, cap
     again = (tmp_path / "report.html").read_bytes()
     run_command(report, tmp_path)
     assert (tmp_path / "report.html").read_bytes() == again
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("everything", [True, False], ids=["everything", "the command alone"])
+def test_killed_in_the_middle_of_a_training_a_suite_ends_with_the_same_results(
+    small_maze, tmp_path, everything
+):
+    """kill -9 of the command, or of all its processes; the same command then ends as an unharmed one."""
+    results = {}
+    for name in ("whole", "killed"):
+        root = tmp_path / name
+        command = [
+            *(sys.executable, "-c", "from lerobot_swr.cli.reproduce import main; main()", "--suite=table1"),
+            *(f"--datasets=[{small_maze.name}]", f"--dataset_dir={small_maze.parent}", "--policies=[wzbc]"),
+            *("--steps=3000", "--seeds=2", "--n_rollouts=6", "--jobs=2", f"--output_dir={root}"),
+        ]
+        if name == "killed":
+            running = subprocess.Popen(command, start_new_session=True)
+            while not list(root.glob("work/train-*/run/seed_1/checkpoints/000300")):
+                assert running.poll() is None, "ended before it could be killed"
+                time.sleep(0.1)
+            kill = os.killpg if everything else os.kill
+            kill(running.pid, signal.SIGKILL)
+            running.wait()
+            assert not list(root.glob("results/train-*"))
+        subprocess.run(command, check=True, timeout=600)
+        stored = [json.loads(path.read_text()) for path in sorted((root / "results").iterdir())]
+        results[name] = [(one["key"], one["result"]) for one in stored]
+        weights = [p.read_bytes() for p in sorted(root.rglob("model.safetensors"))]
+        results[f"{name} weights"] = weights
+    assert results["whole"] == results["killed"]
+    assert results["whole weights"] == results["killed weights"]
+    assert len(results["whole weights"]) == 2

@@ -14,8 +14,8 @@ NOTHING = "–"
 
 INTERVALS = (
     "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
-    "would score as the mean over as many seeds [central 95 %]. Success and style fidelity: over all "
-    "rollouts [Wilson 95 %], lowest to highest seed in parentheses."
+    "would score as the mean over as many seeds [central 95 %]; * L1 lies outside of it. "
+    "Success and style fidelity: over all rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
 
 
@@ -38,8 +38,11 @@ def share(rate: Rate | None) -> str:
 
 
 def l1(summary: Summary | None) -> str:
-    """L1 with its interval."""
-    return NOTHING if summary is None else f"{summary.l1:.3f}\n{bracket(summary.l1_interval)}"
+    """L1 with its interval, and a star if a perfect reproducer would hardly score it."""
+    if summary is None:
+        return NOTHING
+    outside = not summary.floor.band.low <= summary.l1 <= summary.floor.band.high
+    return f"{summary.l1:.3f}{' *' if outside else ''}\n{bracket(summary.l1_interval)}"
 
 
 def floor(summary: Summary | None) -> str:
