@@ -7,19 +7,16 @@ from typing import Any, Self, cast
 
 import numpy as np
 import torch
-from huggingface_hub import ModelCard
 from lerobot.configs import parser
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.network import ActionNetwork
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
+from lerobot_swr.policies.state_policy import StatePolicy
 from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import cached_distances
 from lerobot_swr.style_encoding import Frames, encode_styles
@@ -36,15 +33,8 @@ HELD_OUT_ENCODING_STEPS = 100
 HELD_OUT_FRAMES = 64  # per episode, evenly spread over it
 HELD_OUT_CHUNK = 32  # episodes encoded at once
 
-INSTALL_HINT = """
-## Install
 
-This policy is a LeRobot plugin: `pip install lerobot_policy_swr`, then use it with `lerobot-eval`,
-`lerobot-rollout` or `lerobot-train` as any LeRobot policy.
-"""
-
-
-class BCPolicy(PreTrainedPolicy):
+class BCPolicy(StatePolicy):
     """Behaviour cloning: a deterministic policy fitted by squared error.
 
     Args:
@@ -63,10 +53,6 @@ class BCPolicy(PreTrainedPolicy):
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config)
-        config.validate_features()
-        self._leave_out_images()
-        if config.flush_denormal:
-            torch.set_flush_denormal(True)
         self._trajectories: Trajectories | None = None
         self._dataset_meta: LeRobotDatasetMetadata | None = None
         self._new_dataset = False
@@ -81,23 +67,15 @@ class BCPolicy(PreTrainedPolicy):
 
     def _make_network(self) -> ActionNetwork:
         config = self.config
-        inputs = cast(dict, config.input_features)
         return ActionNetwork(
             config.observation_keys,
-            sum(inputs[key].shape[0] for key in config.observation_keys),
+            config.observation_dim,
             self._style_dim,
-            config.action_feature.shape[0],  # type: ignore[union-attr]
+            config.action_dim,
             config.hidden_dim,
             config.num_hidden,
             config.residual,
         )
-
-    def _leave_out_images(self) -> None:
-        images = list(self.config.image_features)
-        if images:
-            logger.warning("Policy %r does not look at images; left out: %s", self.name, ", ".join(images))
-            inputs = cast(dict, self.config.input_features)
-            self.config.input_features = {key: ft for key, ft in inputs.items() if key not in images}
 
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
         """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
@@ -168,47 +146,6 @@ class BCPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """(B, 1, A): this policy predicts one action at a time."""
         return self.select_action(batch).unsqueeze(1)
-
-    # --- Checkpoints ---
-
-    @classmethod
-    def _load_as_safetensor(cls, model: Self, model_file: str, map_location: str, strict: bool) -> Self:  # type: ignore[override]
-        """Load weights; unlike LeRobot's default, a damaged or incomplete file is an error.
-
-        Raises:
-            ValueError: If the file is truncated, or lacks a tensor of the policy or has one of another shape.
-        """
-        try:
-            state = load_file(model_file, device=map_location)
-        except SafetensorError as error:
-            raise ValueError(
-                f"{model_file}: damaged checkpoint ({error}); use another checkpoint, or copy it again"
-            ) from error
-        state = model._translate_checkpoint(state)
-        own = model.state_dict()
-        missing = sorted(set(own) - set(state))
-        misfits = [
-            f"{key}: {tuple(state[key].shape)} in the file, {tuple(own[key].shape)} by config.json"
-            for key in own.keys() & state.keys()
-            if own[key].shape != state[key].shape
-        ]
-        if missing or misfits:
-            raise ValueError(
-                f"{model_file}: does not fit its config.json; missing: {missing}; misfits: {misfits}; "
-                "is it the checkpoint of another policy or dataset?"
-            )
-        model.load_state_dict(state, strict=False)
-        return model
-
-    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The part of a checkpoint that is to be loaded into this policy."""
-        return state
-
-    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
-        """LeRobot's model card, with a word on how to install the plugin."""
-        card = super().generate_model_card(*args, **kwargs)
-        card.text += INSTALL_HINT
-        return card
 
 
 class ZBCPolicy(BCPolicy):
