@@ -145,7 +145,9 @@ class BesoConfig(DdpmGptConfig):
         super().__post_init__()
         if not self.sigma_data > 0:
             raise ValueError(f"sigma_data={self.sigma_data}: expected a number > 0")
-        if not 0 < self.sigma_min < self.sigma_max:
+        least = 1e-3 * self.sigma_data  # the scheduler's single precision ends there
+        if not least <= self.sigma_min < self.sigma_max:
             raise ValueError(
-                f"sigma_min={self.sigma_min}: expected a number > 0 and < sigma_max={self.sigma_max}"
+                f"sigma_min={self.sigma_min}: expected a number >= {least:g} (a thousandth of sigma_data) and "
+                f"< sigma_max={self.sigma_max}"
             )

@@ -148,7 +148,7 @@ class WindowDiffusionPolicy(StatePolicy):
         """(B, A) normalised actions for normalised current observations (B, d)."""
         self.history.push(batch)
         if not self._planned:
-            self._planned.extend(self._sample(self.history.window()).unbind(dim=1))
+            self._planned.extend(self.sample(self.history.window()).unbind(dim=1))
         return self._planned.popleft()
 
     @torch.no_grad()
@@ -158,9 +158,9 @@ class WindowDiffusionPolicy(StatePolicy):
         The observations become part of the rollout's history, as with `select_action`.
         """
         self.history.push(batch)
-        return self._sample(self.history.window())
+        return self.sample(self.history.window())
 
-    def _sample(self, window: dict[str, Tensor], generator: Generators = None) -> Tensor:
+    def sample(self, window: dict[str, Tensor], generator: Generators = None) -> Tensor:
         """(B, C, A) actions to execute, given a window as `ObservationHistory.window` has it."""
         observations, is_pad = self.encoder(window), window["is_pad"]
         like = observations.new_empty(len(observations), self._n_actions, self.config.action_dim)

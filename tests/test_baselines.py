@@ -1,0 +1,395 @@
+"""The baselines ddpm_gpt, ddpm_act and beso as LeRobot sees them."""
+
+import copy
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from conftest import save_checkpoint
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies import PreTrainedPolicy, make_policy
+from lerobot.policies.factory import get_policy_class, make_policy_config
+from safetensors.torch import load_file
+
+from lerobot_swr.policies import baselines
+from lerobot_swr.policies.baselines.averaging import moving_average
+from lerobot_swr.policies.baselines.history import ObservationHistory
+
+BASELINES = ("ddpm_gpt", "ddpm_act", "beso")
+WINDOW, CHUNK = 5, 4
+KEYS = ("observation.state", "observation.environment_state")
+
+
+@pytest.fixture
+def make_baseline(small_maze_meta: LeRobotDatasetMetadata) -> Callable[..., PreTrainedPolicy]:
+    """Builds a small baseline on `small_maze` through LeRobot's factory, the same for the same seed."""
+
+    def make(policy_type: str, seed: int = 0, **options) -> PreTrainedPolicy:
+        torch.manual_seed(seed)
+        options = {"dim_model": 16, "n_heads": 2, "device": "cpu", "push_to_hub": False, **options}
+        policy = make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
+        with torch.no_grad():  # as initialised, the networks say almost nothing
+            for parameter in policy.network.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+        policy.average.module.load_state_dict(policy.network.state_dict())
+        return policy.eval()
+
+    return make
+
+
+def make_windows(n_windows: int = 32, policy_type: str = "beso", n_pads: int = 0, seed: int = 1) -> dict:
+    """A batch of normalised windows of the small maze's dimensions, the first `n_pads` steps padded."""
+    generator = torch.Generator().manual_seed(seed)
+    n_actions = CHUNK if policy_type == "ddpm_act" else WINDOW
+    batch = {key: torch.randn(n_windows, WINDOW, 2, generator=generator) for key in KEYS}
+    before = torch.arange(WINDOW).expand(n_windows, -1) < n_pads
+    # A chunk's padding comes after the episode's end, a window's before its start.
+    padded = before if policy_type != "ddpm_act" else torch.arange(CHUNK, 0, -1).expand(n_windows, -1) <= n_pads
+    return {
+        **batch,
+        "action": torch.randn(n_windows, n_actions, 2, generator=generator),
+        "observation.state_is_pad": before,
+        "action_is_pad": padded,
+    }
+
+
+def network_output(policy, batch):
+    """What the network says of a batch's actions at one noise level."""
+    level = torch.full((len(batch["action"]),), 0.5 if policy.name == "beso" else 1)
+    with torch.no_grad():
+        return policy.network(
+            policy.encoder(batch), batch["action"], level, batch["observation.state_is_pad"]
+        )
+
+
+def generators(seeds):
+    return [torch.Generator().manual_seed(int(seed)) for seed in seeds]
+
+
+def train_briefly(policy, steps=5):
+    optimizer = policy.config.get_optimizer_preset().build(policy.get_optim_params())
+    policy.train()
+    for step in range(steps):
+        loss, _ = policy.forward(make_windows(policy_type=policy.name, seed=step))
+        loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+        policy.update()
+    return policy.eval()
+
+
+# --- what the networks see ---
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+@pytest.mark.parametrize("n_pads", [1, 3])
+def test_padded_steps_do_not_change_the_loss(make_baseline, policy_type, n_pads):
+    """Whatever stands before the episode's start or after its end, nothing is learned from it."""
+    policy = make_baseline(policy_type)
+    batch = make_windows(policy_type=policy_type, n_pads=n_pads)
+    other = {key: value.clone() for key, value in batch.items()}
+    for key in KEYS:
+        other[key][batch["observation.state_is_pad"]] = 7.0
+    other["action"][batch["action_is_pad"]] = -7.0
+    expected, found = (policy.forward(b, reduction="none")[0] for b in (batch, other))
+    torch.testing.assert_close(found, expected)
+    assert expected.mean() == pytest.approx(policy.forward(batch)[0].item())
+    assert (policy.forward(make_windows(policy_type=policy_type), reduction="none")[0] != expected).all()
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+@pytest.mark.parametrize("step", [1, 3])
+def test_no_action_depends_on_later_steps(make_baseline, policy_type, step):
+    """A changed action changes its own prediction and those after it alone; so does an observation in a GPT."""
+    policy = make_baseline(policy_type)
+    batch = make_windows(policy_type=policy_type)
+    expected = network_output(policy, batch)
+    for key in ("action",) if policy_type == "ddpm_act" else ("action", "observation.state"):
+        changed = {**batch, key: batch[key].clone()}
+        changed[key][:, step] += 1
+        differs = (network_output(policy, changed) - expected).abs().amax(dim=(0, 2)) > 1e-4
+        assert differs.tolist() == [i >= step for i in range(expected.shape[1])], key
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_every_observation_and_the_noise_level_count(make_baseline, policy_type):
+    """The last prediction depends on each step of the window, and on the level."""
+    policy = make_baseline(policy_type)
+    batch = make_windows(policy_type=policy_type)
+    expected = network_output(policy, batch)[:, -1]
+    for step in range(WINDOW):
+        changed = {**batch, KEYS[0]: batch[KEYS[0]].clone()}
+        changed[KEYS[0]][:, step] += 1
+        assert ((network_output(policy, changed)[:, -1] - expected).abs() > 1e-4).any()
+    other_level = policy.network(
+        policy.encoder(batch), batch["action"], torch.full((32,), 3.0), batch["observation.state_is_pad"]
+    )
+    assert ((other_level[:, -1] - expected).abs() > 1e-4).any()
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_dropout_is_where_it_was_published(make_baseline, policy_type):
+    """Attention has its own; feed-forward blocks have none inside."""
+    policy = make_baseline(policy_type, attention_dropout=0.4, residual_dropout=0.3)
+    layers = [m for m in policy.network.modules() if hasattr(m, "linear1")]
+    assert layers
+    for layer in layers:
+        assert (layer.self_attn.dropout, layer.dropout.p, layer.dropout1.p, layer.dropout2.p) == (
+            *(0.4, 0.0, 0.3, 0.3),
+        )
+
+
+# --- rollouts ---
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_a_batch_of_one_is_a_row_of_a_larger_batch(make_baseline, policy_type):
+    """Environments do not see each other, each has noise of its own."""
+    policy = make_baseline(policy_type)
+    history = make_windows(policy_type=policy_type)
+    window = {**{key: history[key] for key in KEYS}, "is_pad": torch.arange(WINDOW).expand(32, -1) < 2}
+    policy.reset()
+    drawn = policy.sample(window, generators(range(32)))
+    assert drawn.shape == (32, CHUNK if policy_type == "ddpm_act" else 1, 2)
+    assert len(drawn[:, 0].unique(dim=0)) > 16  # not all: some are clipped
+    for row in (0, 17):
+        policy.reset()
+        alone = policy.sample({key: value[row : row + 1] for key, value in window.items()}, generators([row]))
+        torch.testing.assert_close(alone, drawn[row : row + 1], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_a_finished_environment_does_not_disturb_the_others(make_baseline, policy_type):
+    """The first environment starts anew in the middle; the second one's actions stay the same."""
+    policy = make_baseline(policy_type)
+
+    def actions_of_the_second(jump: float) -> torch.Tensor:
+        torch.manual_seed(3)
+        policy.reset()
+        steps = []
+        for step in range(12):
+            observations = make_windows(n_windows=2, seed=step)
+            now = {key: observations[key][:, 0].clone() for key in KEYS}
+            if step > 4:
+                now[KEYS[0]][0] += jump
+            steps.append(policy.select_action(now)[1])
+        return torch.stack(steps)
+
+    torch.testing.assert_close(actions_of_the_second(0.0), actions_of_the_second(5.0), rtol=1e-4, atol=1e-4)
+
+
+def test_the_history_is_what_the_dataset_gives(small_maze):
+    """Fed frame by frame, window and padding equal those of LeRobot's dataset, from the first frame on."""
+    meta = LeRobotDatasetMetadata("local/small_maze", root=small_maze)
+    timestamps = resolve_delta_timestamps(make_policy_config("beso", device="cpu"), meta)
+    dataset = LeRobotDataset("local/small_maze", root=small_maze, delta_timestamps=timestamps)
+    history = ObservationHistory(KEYS, WINDOW)
+    for episode in (0, 1):
+        history.clear()
+        first = meta.episodes[episode]["dataset_from_index"]
+        for index in range(first, first + 8):
+            frame = dataset[index]
+            history.push({key: frame[key][-1][None] for key in KEYS})
+            window = history.window()
+            for key in KEYS:
+                assert torch.equal(window[key][0], frame[key])
+            assert torch.equal(window["is_pad"][0], frame["observation.state_is_pad"])
+
+
+def test_the_number_of_environments_is_fixed_within_a_rollout(make_baseline):
+    """The error says what to do."""
+    policy = make_baseline("beso")
+    frames = {key: torch.zeros(4, 2) for key in KEYS}
+    policy.select_action(frames)
+    with pytest.raises(ValueError, match=r"batch of 3 .* rollout of 4 .*policy.reset\(\)"):
+        policy.select_action({key: value[:3] for key, value in frames.items()})
+    policy.reset()
+    assert policy.select_action({key: value[:3] for key, value in frames.items()}).shape == (3, 2)
+
+
+def test_a_chunk_is_executed_whole_before_the_next_is_planned(make_baseline, monkeypatch):
+    """ddpm_act denoises at steps 0, 4, 8, ..., from the five latest observations."""
+    policy = make_baseline("ddpm_act")
+    windows = []
+
+    def sample(window):
+        windows.append(window[KEYS[0]][0, :, 0].tolist())
+        return torch.arange(4.0).reshape(1, 4, 1).expand(3, 4, 2) + 10 * len(windows)
+
+    monkeypatch.setattr(policy, "sample", sample)
+    policy.reset()
+    actions = [policy.select_action({key: torch.full((3, 2), float(i)) for key in KEYS}) for i in range(9)]
+    assert [a[0, 0].item() for a in actions] == [10, 11, 12, 13, 20, 21, 22, 23, 30]
+    assert windows == [[0.0] * 5, [0, 1, 2, 3, 4], [4, 5, 6, 7, 8]]
+
+
+def test_beso_starts_from_the_actions_that_were_executed(make_baseline, monkeypatch):
+    """The newest action starts as noise of size σ_max, those before it as what was done."""
+    policy = make_baseline("beso", sigma_min=0.001, sigma_max=0.002)
+    starts, denoise = [], policy.process.denoise
+
+    def record(network, actions, *rest):
+        starts.append(actions.clone())
+        return denoise(network, actions, *rest)
+
+    monkeypatch.setattr(policy.process, "denoise", record)
+    policy.reset()
+    done = torch.stack([policy.select_action({key: torch.ones(6, 2) for key in KEYS}) for _ in range(7)], 1)
+    assert 0 < starts[0].abs().max() < 0.02
+    torch.testing.assert_close(starts[2][:, 2:4], done[:, :2])
+    torch.testing.assert_close(starts[6][:, :4], done[:, 2:6])
+    assert 0 < starts[6][:, 4].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_actions_stay_within_those_of_the_demonstrations(make_baseline, small_maze_meta, policy_type):
+    """The bounds are the dataset's least and largest actions, normalised by hand."""
+    policy = make_baseline(policy_type)
+    stats = small_maze_meta.stats["action"]
+    low, high = ((stats[key] - stats["mean"]) / stats["std"] for key in ("min", "max"))
+    np.testing.assert_allclose(policy.action_low, low, rtol=1e-4)
+    np.testing.assert_allclose(policy.action_high, high, rtol=1e-4)
+    actions = policy.predict_action_chunk({key: 9 * torch.randn(200, 2) for key in KEYS})
+    assert (actions >= policy.action_low).all()
+    assert (actions <= policy.action_high).all()
+
+
+# --- the moving average ---
+
+
+def test_the_average_follows_the_published_rule():
+    """Against the recursion on a single weight, warm-up included."""
+    network = torch.nn.Linear(1, 1, bias=False)
+    average = moving_average(network, decay=0.5)
+    expected = None
+    for n in range(1, 12):
+        with torch.no_grad():
+            network.weight.fill_(n**2)
+        average.update_parameters(network)
+        keep = min(0.5, (1 + n) / (10 + n))
+        expected = n**2 if expected is None else keep * expected + (1 - keep) * n**2
+        assert average.module.weight.item() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_the_average_acts_and_is_not_trained(make_baseline, policy_type):
+    """Actions do not depend on the trained weights; the optimizer does not know the average."""
+    policy = train_briefly(make_baseline(policy_type))
+    trained = {id(p) for p in policy.get_optim_params()}
+    assert trained == {id(p) for p in policy.parameters() if p.requires_grad}
+    assert not trained & {id(p) for p in policy.average.parameters()}
+
+    def act():
+        torch.manual_seed(0)
+        policy.reset()
+        return policy.select_action({key: torch.ones(3, 2) for key in KEYS})
+
+    expected = act()
+    with torch.no_grad():
+        policy.network.head.weight.add_(1)
+    assert torch.equal(act(), expected)
+    with torch.no_grad():
+        policy.average.module.head.weight.add_(1)
+    assert not torch.equal(act(), expected)
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_a_checkpoint_holds_weights_and_average_and_acts_alike(
+    make_baseline, small_maze_meta, tmp_path, policy_type
+):
+    """Saved, loaded: both sets of weights, the number of updates, the bounds and the actions."""
+    policy = train_briefly(make_baseline(policy_type))
+    save_checkpoint(policy, small_maze_meta, tmp_path / "c")
+    saved = load_file(tmp_path / "c" / "model.safetensors")
+    assert torch.equal(saved["average.module.head.weight"], policy.average.module.head.weight)
+    assert not torch.equal(saved["average.module.head.weight"], saved["network.head.weight"])
+    assert saved["average.n_averaged"] == 5
+    config = PreTrainedConfig.from_pretrained(tmp_path / "c")
+    loaded = get_policy_class(policy_type).from_pretrained(tmp_path / "c", config=config)
+    for name, value in policy.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    actions = []
+    for candidate in (policy, loaded):
+        torch.manual_seed(5)
+        candidate.reset()
+        actions.append([candidate.select_action({key: torch.ones(3, 2) for key in KEYS}) for _ in range(6)])
+    assert torch.equal(torch.stack(actions[0]), torch.stack(actions[1]))
+
+
+def test_on_other_data_the_bounds_are_new(make_baseline, small_maze_meta, tmp_path):
+    """Fine-tuning normalises by the new dataset's statistics, so the checkpoint's bounds mean nothing."""
+    save_checkpoint(make_baseline("beso"), small_maze_meta, tmp_path / "c")
+    stats = copy.deepcopy(small_maze_meta.stats)
+    stats["action"]["max"] = stats["action"]["mean"] + 3 * stats["action"]["std"]
+    config = PreTrainedConfig.from_pretrained(tmp_path / "c")
+    tuned = get_policy_class("beso").from_pretrained(tmp_path / "c", config=config, dataset_stats=stats)
+    torch.testing.assert_close(tuned.action_high, torch.tensor([3.0, 3.0]), rtol=1e-4, atol=0)
+
+
+# --- draws ---
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_a_steps_draws_depend_on_the_step_alone(make_baseline, policy_type):
+    """Noise, levels and dropout: the same after other use of torch's generator, which is left as it was."""
+    policy = make_baseline(policy_type).train()
+    batch = make_windows(policy_type=policy_type)
+    twin = copy.deepcopy(policy)
+    first = policy.forward(batch)[0]
+    torch.manual_seed(99)
+    before = torch.get_rng_state()
+    assert torch.equal(twin.forward(batch)[0], first)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert not torch.equal(twin.forward(batch)[0], first)
+
+
+def test_the_held_out_loss_is_the_averages_and_draws_alike_every_time(make_baseline):
+    """Taking it neither changes the loss nor what the next step draws."""
+    policy = train_briefly(make_baseline("ddpm_gpt"))
+    step = policy.draws.step.clone()
+    batch = make_windows(policy_type="ddpm_gpt")
+    loss = policy.forward(batch)[0]
+    with torch.no_grad():
+        policy.network.head.weight.add_(1)
+    assert torch.equal(policy.forward(batch)[0], loss)
+    assert torch.equal(policy.draws.step, step)
+
+
+# --- bad input ---
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "options", "message"),
+    [
+        ("ddpm_gpt", {"n_layers": 0}, "n_layers=0"),
+        ("ddpm_gpt", {"dim_model": 70}, "dim_model=70: .*n_heads=4"),
+        ("ddpm_gpt", {"attention_dropout": 1.0}, "attention_dropout=1.0"),
+        ("ddpm_gpt", {"n_obs_steps": 0}, "n_obs_steps=0"),
+        ("ddpm_act", {"chunk_size": 0}, "chunk_size=0"),
+        ("ddpm_act", {"ema_decay": -0.1}, "ema_decay=-0.1"),
+        ("beso", {"sigma_min": 2.0}, "sigma_min=2.0: .*sigma_max=1.0"),
+        ("beso", {"sigma_data": 0.0}, "sigma_data=0.0"),
+        ("beso", {"sigma_min": 1e-5}, "sigma_min=1e-05: .*0.0005"),
+        ("beso", {"denoising_steps": 0}, "denoising_steps=0"),
+    ],
+)
+def test_bad_values_are_named_when_the_configuration_is_made(policy_type, options, message):
+    """Before a dataset is even looked at."""
+    with pytest.raises(ValueError, match=message):
+        make_policy_config(policy_type, device="cpu", **options)
+
+
+def test_without_diffusers_the_extra_is_named(monkeypatch):
+    """When the policy's class is asked for; configurations work without it."""
+    for module in [name for name in sys.modules if name.startswith("lerobot_swr.policies.baselines.")]:
+        if not module.endswith("configuration_baselines"):
+            monkeypatch.delitem(sys.modules, module)
+    monkeypatch.delattr(baselines, "dependencies")
+    monkeypatch.setitem(sys.modules, "diffusers.schedulers.scheduling_ddpm", None)
+    config = make_policy_config("beso", device="cpu")
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'lerobot_policy_swr\[baselines\]'"):
+        get_policy_class(config.type)
