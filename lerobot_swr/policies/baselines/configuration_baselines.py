@@ -148,6 +148,6 @@ class BesoConfig(DdpmGptConfig):
         least = 1e-3 * self.sigma_data  # the scheduler's single precision ends there
         if not least <= self.sigma_min < self.sigma_max:
             raise ValueError(
-                f"sigma_min={self.sigma_min}: expected a number >= {least:g} (a thousandth of sigma_data) and "
-                f"< sigma_max={self.sigma_max}"
+                f"sigma_min={self.sigma_min}: expected a number >= {least:g} (a thousandth of "
+                f"sigma_data) and < sigma_max={self.sigma_max}"
             )
