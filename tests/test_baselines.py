@@ -48,9 +48,7 @@ def make_windows(n_windows: int = 32, policy_type: str = "beso", n_pads: int = 0
     batch = {key: torch.randn(n_windows, WINDOW, 2, generator=generator) for key in KEYS}
     before = torch.arange(WINDOW).expand(n_windows, -1) < n_pads
     # A chunk's padding comes after the episode's end, a window's before its start.
-    padded = (
-        before if policy_type != "ddpm_act" else torch.arange(CHUNK, 0, -1).expand(n_windows, -1) <= n_pads
-    )
+    after = torch.arange(CHUNK, 0, -1).expand(n_windows, -1) <= n_pads
     return {
         **batch,
         "action": torch.randn(n_windows, n_actions, 2, generator=generator),
@@ -131,6 +129,20 @@ def test_every_observation_and_the_noise_level_count(make_baseline, policy_type)
         policy.encoder(batch), batch["action"], torch.full((32,), 3.0), batch["observation.state_is_pad"]
     )
     assert ((other_level[:, -1] - expected).abs() > 1e-4).any()
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
+def test_training_and_inference_see_the_same_network(make_baseline, policy_type):
+    """PyTorch runs other kernels in training; masks, padding and layers are those of inference."""
+    policy = make_baseline(policy_type, attention_dropout=0.0, residual_dropout=0.0)
+    batch = make_windows(policy_type=policy_type, n_pads=2)
+    expected = network_output(policy, batch)
+    level = torch.full((32,), 0.5 if policy_type == "beso" else 1)
+    found = policy.train().network(
+        policy.encoder(batch), batch["action"], level, batch["observation.state_is_pad"]
+    )
+    kept = ~batch["action_is_pad"]
+    torch.testing.assert_close(found[kept], expected[kept], rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("policy_type", BASELINES)

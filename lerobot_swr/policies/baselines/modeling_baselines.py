@@ -128,7 +128,7 @@ class WindowDiffusionPolicy(StatePolicy):
         So that a resumed run draws what an uninterrupted one does, see `StepGenerator`.
         """
         seed = self.draws.next().initial_seed() if self.training else int(self.draws.seed)
-        with torch.random.fork_rng([] if device.type == "cpu" else [device], device_type=device.type):
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
             torch.manual_seed(seed)
             yield
 
