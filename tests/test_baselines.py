@@ -2,59 +2,18 @@
 
 import copy
 import sys
-from collections.abc import Callable
 
-import numpy as np
 import pytest
 import torch
-from conftest import save_checkpoint
+from conftest import OBSERVATIONS, WINDOW, make_windows, save_checkpoint
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
-from lerobot.datasets.factory import resolve_delta_timestamps
-from lerobot.policies import PreTrainedPolicy, make_policy
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 
 from lerobot_swr.policies import baselines
 from lerobot_swr.policies.baselines.averaging import moving_average
-from lerobot_swr.policies.baselines.history import ObservationHistory
 
 BASELINES = ("ddpm_gpt", "ddpm_act", "beso")
-WINDOW, CHUNK = 5, 4
-KEYS = ("observation.state", "observation.environment_state")
-
-
-@pytest.fixture
-def make_baseline(small_maze_meta: LeRobotDatasetMetadata) -> Callable[..., PreTrainedPolicy]:
-    """Builds a small baseline on `small_maze` through LeRobot's factory, the same for the same seed."""
-
-    def make(policy_type: str, seed: int = 0, **options) -> PreTrainedPolicy:
-        torch.manual_seed(seed)
-        options = {"dim_model": 16, "n_heads": 2, "device": "cpu", "push_to_hub": False, **options}
-        policy = make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
-        with torch.no_grad():  # as initialised, the networks say almost nothing
-            for parameter in policy.network.parameters():
-                parameter.add_(0.3 * torch.randn_like(parameter))
-        policy.average.module.load_state_dict(policy.network.state_dict())
-        return policy.eval()
-
-    return make
-
-
-def make_windows(n_windows: int = 32, policy_type: str = "beso", n_pads: int = 0, seed: int = 1) -> dict:
-    """A batch of normalised windows of the small maze's dimensions, the first `n_pads` steps padded."""
-    generator = torch.Generator().manual_seed(seed)
-    n_actions = CHUNK if policy_type == "ddpm_act" else WINDOW
-    batch = {key: torch.randn(n_windows, WINDOW, 2, generator=generator) for key in KEYS}
-    before = torch.arange(WINDOW).expand(n_windows, -1) < n_pads
-    # A chunk's padding comes after the episode's end, a window's before its start.
-    after = torch.arange(CHUNK, 0, -1).expand(n_windows, -1) <= n_pads
-    return {
-        **batch,
-        "action": torch.randn(n_windows, n_actions, 2, generator=generator),
-        "observation.state_is_pad": before,
-        "action_is_pad": after if policy_type == "ddpm_act" else before,
-    }
 
 
 def network_output(policy, batch):
@@ -64,10 +23,6 @@ def network_output(policy, batch):
         return policy.network(
             policy.encoder(batch), batch["action"], level, batch["observation.state_is_pad"]
         )
-
-
-def generators(seeds):
-    return [torch.Generator().manual_seed(int(seed)) for seed in seeds]
 
 
 def train_briefly(policy, steps=5):
@@ -92,7 +47,7 @@ def test_padded_steps_do_not_change_the_loss(make_baseline, policy_type, n_pads)
     policy = make_baseline(policy_type)
     batch = make_windows(policy_type=policy_type, n_pads=n_pads)
     other = {key: value.clone() for key, value in batch.items()}
-    for key in KEYS:
+    for key in OBSERVATIONS:
         other[key][batch["observation.state_is_pad"]] = 7.0
     other["action"][batch["action_is_pad"]] = -7.0
     expected, found = (policy.forward(b, reduction="none")[0] for b in (batch, other))
@@ -122,8 +77,8 @@ def test_every_observation_and_the_noise_level_count(make_baseline, policy_type)
     batch = make_windows(policy_type=policy_type)
     expected = network_output(policy, batch)[:, -1]
     for step in range(WINDOW):
-        changed = {**batch, KEYS[0]: batch[KEYS[0]].clone()}
-        changed[KEYS[0]][:, step] += 1
+        changed = {**batch, OBSERVATIONS[0]: batch[OBSERVATIONS[0]].clone()}
+        changed[OBSERVATIONS[0]][:, step] += 1
         assert ((network_output(policy, changed)[:, -1] - expected).abs() > 1e-4).any()
     other_level = policy.network(
         policy.encoder(batch), batch["action"], torch.full((32,), 3.0), batch["observation.state_is_pad"]
@@ -157,121 +112,6 @@ def test_dropout_is_where_it_was_published(make_baseline, policy_type):
         )
 
 
-# --- rollouts ---
-
-
-@pytest.mark.parametrize("policy_type", BASELINES)
-def test_a_batch_of_one_is_a_row_of_a_larger_batch(make_baseline, policy_type):
-    """Environments do not see each other, each has noise of its own."""
-    policy = make_baseline(policy_type)
-    history = make_windows(policy_type=policy_type)
-    window = {**{key: history[key] for key in KEYS}, "is_pad": torch.arange(WINDOW).expand(32, -1) < 2}
-    policy.reset()
-    drawn = policy.sample(window, generators(range(32)))
-    assert drawn.shape == (32, CHUNK if policy_type == "ddpm_act" else 1, 2)
-    assert len(drawn[:, 0].unique(dim=0)) > 16  # not all: some are clipped
-    for row in (0, 17):
-        policy.reset()
-        alone = policy.sample({key: value[row : row + 1] for key, value in window.items()}, generators([row]))
-        torch.testing.assert_close(alone, drawn[row : row + 1], rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize("policy_type", BASELINES)
-def test_a_finished_environment_does_not_disturb_the_others(make_baseline, policy_type):
-    """The first environment starts anew in the middle; the second one's actions stay the same."""
-    policy = make_baseline(policy_type)
-
-    def actions_of_the_second(jump: float) -> torch.Tensor:
-        torch.manual_seed(3)
-        policy.reset()
-        steps = []
-        for step in range(12):
-            observations = make_windows(n_windows=2, seed=step)
-            now = {key: observations[key][:, 0].clone() for key in KEYS}
-            if step > 4:
-                now[KEYS[0]][0] += jump
-            steps.append(policy.select_action(now)[1])
-        return torch.stack(steps)
-
-    torch.testing.assert_close(actions_of_the_second(0.0), actions_of_the_second(5.0), rtol=1e-4, atol=1e-4)
-
-
-def test_the_history_is_what_the_dataset_gives(small_maze):
-    """Fed frame by frame, window and padding equal those of LeRobot's dataset, from the first frame on."""
-    meta = LeRobotDatasetMetadata("local/small_maze", root=small_maze)
-    timestamps = resolve_delta_timestamps(make_policy_config("beso", device="cpu"), meta)
-    dataset = LeRobotDataset("local/small_maze", root=small_maze, delta_timestamps=timestamps)
-    history = ObservationHistory(KEYS, WINDOW)
-    for episode in (0, 1):
-        history.clear()
-        first = meta.episodes[episode]["dataset_from_index"]
-        for index in range(first, first + 8):
-            frame = dataset[index]
-            history.push({key: frame[key][-1][None] for key in KEYS})
-            window = history.window()
-            for key in KEYS:
-                assert torch.equal(window[key][0], frame[key])
-            assert torch.equal(window["is_pad"][0], frame["observation.state_is_pad"])
-
-
-def test_the_number_of_environments_is_fixed_within_a_rollout(make_baseline):
-    """The error says what to do."""
-    policy = make_baseline("beso")
-    frames = {key: torch.zeros(4, 2) for key in KEYS}
-    policy.select_action(frames)
-    with pytest.raises(ValueError, match=r"batch of 3 .* rollout of 4 .*policy.reset\(\)"):
-        policy.select_action({key: value[:3] for key, value in frames.items()})
-    policy.reset()
-    assert policy.select_action({key: value[:3] for key, value in frames.items()}).shape == (3, 2)
-
-
-def test_a_chunk_is_executed_whole_before_the_next_is_planned(make_baseline, monkeypatch):
-    """ddpm_act denoises at steps 0, 4, 8, ..., from the five latest observations."""
-    policy = make_baseline("ddpm_act")
-    windows = []
-
-    def sample(window):
-        windows.append(window[KEYS[0]][0, :, 0].tolist())
-        return torch.arange(4.0).reshape(1, 4, 1).expand(3, 4, 2) + 10 * len(windows)
-
-    monkeypatch.setattr(policy, "sample", sample)
-    policy.reset()
-    actions = [policy.select_action({key: torch.full((3, 2), float(i)) for key in KEYS}) for i in range(9)]
-    assert [a[0, 0].item() for a in actions] == [10, 11, 12, 13, 20, 21, 22, 23, 30]
-    assert windows == [[0.0] * 5, [0, 1, 2, 3, 4], [4, 5, 6, 7, 8]]
-
-
-def test_beso_starts_from_the_actions_that_were_executed(make_baseline, monkeypatch):
-    """The newest action starts as noise of size σ_max, those before it as what was done."""
-    policy = make_baseline("beso", sigma_min=0.001, sigma_max=0.002)
-    starts, denoise = [], policy.process.denoise
-
-    def record(network, actions, *rest):
-        starts.append(actions.clone())
-        return denoise(network, actions, *rest)
-
-    monkeypatch.setattr(policy.process, "denoise", record)
-    policy.reset()
-    done = torch.stack([policy.select_action({key: torch.ones(6, 2) for key in KEYS}) for _ in range(7)], 1)
-    assert 0 < starts[0].abs().max() < 0.02
-    torch.testing.assert_close(starts[2][:, 2:4], done[:, :2])
-    torch.testing.assert_close(starts[6][:, :4], done[:, 2:6])
-    assert 0 < starts[6][:, 4].abs().max() < 0.02
-
-
-@pytest.mark.parametrize("policy_type", BASELINES)
-def test_actions_stay_within_those_of_the_demonstrations(make_baseline, small_maze_meta, policy_type):
-    """The bounds are the dataset's least and largest actions, normalised by hand."""
-    policy = make_baseline(policy_type)
-    stats = small_maze_meta.stats["action"]
-    low, high = ((stats[key] - stats["mean"]) / stats["std"] for key in ("min", "max"))
-    np.testing.assert_allclose(policy.action_low, low, rtol=1e-4)
-    np.testing.assert_allclose(policy.action_high, high, rtol=1e-4)
-    actions = policy.predict_action_chunk({key: 9 * torch.randn(200, 2) for key in KEYS})
-    assert (actions >= policy.action_low).all()
-    assert (actions <= policy.action_high).all()
-
-
 # --- the moving average ---
 
 
@@ -300,7 +140,7 @@ def test_the_average_acts_and_is_not_trained(make_baseline, policy_type):
     def act():
         torch.manual_seed(0)
         policy.reset()
-        return policy.select_action({key: torch.ones(3, 2) for key in KEYS})
+        return policy.select_action({key: torch.ones(3, 2) for key in OBSERVATIONS})
 
     expected = act()
     with torch.no_grad():
@@ -330,7 +170,9 @@ def test_a_checkpoint_holds_weights_and_average_and_acts_alike(
     for candidate in (policy, loaded):
         torch.manual_seed(5)
         candidate.reset()
-        actions.append([candidate.select_action({key: torch.ones(3, 2) for key in KEYS}) for _ in range(6)])
+        actions.append(
+            [candidate.select_action({key: torch.ones(3, 2) for key in OBSERVATIONS}) for _ in range(6)]
+        )
     assert torch.equal(torch.stack(actions[0]), torch.stack(actions[1]))
 
 
