@@ -44,8 +44,6 @@ class BCPolicy(DatasetPolicy):
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta)
-        if config.flush_denormal:
-            torch.set_flush_denormal(True)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
 
@@ -55,12 +53,11 @@ class BCPolicy(DatasetPolicy):
 
     def _make_network(self) -> ActionNetwork:
         config = self.config
-        inputs = cast(dict, config.input_features)
         return ActionNetwork(
             config.observation_keys,
-            sum(inputs[key].shape[0] for key in config.observation_keys),
+            config.observation_dim,
             self._style_dim,
-            config.action_feature.shape[0],  # type: ignore[union-attr]
+            config.action_dim,
             config.hidden_dim,
             config.num_hidden,
             config.residual,
