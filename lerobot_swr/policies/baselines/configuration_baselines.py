@@ -44,6 +44,9 @@ class WindowDiffusionConfig(StateConfig):
     lr_schedule: str = "constant"
     # Decay of the moving average of the weights, which is what acts.
     ema_decay: float = 0.995
+    # How often each window of a batch is noised, to another level each time. LeRobot takes longer to load a
+    # window than the network to learn from it, so a few draws are almost free; the benchmark draws once.
+    noise_draws: int = 1
 
     @tells_bad_values
     def __post_init__(self) -> None:
@@ -53,7 +56,7 @@ class WindowDiffusionConfig(StateConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
-        self.check_at_least_one("n_obs_steps", "dim_model", "n_heads", "denoising_steps")
+        self.check_at_least_one("n_obs_steps", "dim_model", "n_heads", "denoising_steps", "noise_draws")
         if self.dim_model % self.n_heads or self.dim_model % 2:
             raise ValueError(
                 f"dim_model={self.dim_model}: expected an even multiple of n_heads={self.n_heads}"
