@@ -1,0 +1,112 @@
+"""Actions that are targets of the state, and how a policy learns them: relative to the state."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+TARGET_SHARE = 0.5
+"""An action dimension is a target if subtracting the state removes this share of its variance. Absolute joint
+targets reach .7 to 1 (Unitree G1), velocities and displacements stay below 0 (Maze2D, D3IL)."""
+
+
+def target_dimensions(states: np.ndarray, actions: np.ndarray, absolute: bool | None = None) -> np.ndarray:
+    """The state dimension whose target each action dimension is.
+
+    Args:
+        states: (F, d).
+        actions: (F, A).
+        absolute: True takes every dimension that moves for a target, of the state dimension that explains it
+            best; False none; None asks the data.
+
+    Returns:
+        (A,) int64, -1 where the action is no target.
+    """
+    found = np.full(actions.shape[1], -1)
+    if absolute is False:
+        return found
+    for k, action in enumerate(actions.T.astype(np.float64)):
+        variance = action.var()
+        if variance == 0:
+            continue
+        removed = 1 - (action[:, None] - states).var(axis=0) / variance  # (d,)
+        if absolute or removed.max() >= TARGET_SHARE:
+            found[k] = int(removed.argmax())
+    return found
+
+
+def relative_to_state(actions: Tensor, states: Tensor, targets: Tensor) -> Tensor:
+    """Actions (F, A) minus the states (F, d) whose `targets` (A,) they are, in raw units."""
+    return actions - states[:, targets.clamp(min=0)] * (targets >= 0)
+
+
+@dataclass(frozen=True)
+class Units:
+    """The linear map from raw to normalised numbers: normalised = scale · raw + offset, (d,) each."""
+
+    scale: Tensor
+    offset: Tensor
+
+    def normalize(self, raw: Tensor) -> Tensor:
+        """Normalised numbers (F, d) of raw ones."""
+        return raw * self.scale + self.offset
+
+
+class RelativeActions(nn.Module):
+    """Translates between actions and what the network predicts: actions relative to the state, standardised.
+
+    Both sides are in normalised units: action = state_gain · state + offset + scale · output. The identity
+    where an action is no target.
+
+    Args:
+        action_dim: A.
+        state_dim: d.
+    """
+
+    def __init__(self, action_dim: int, state_dim: int):
+        super().__init__()
+        self.state_gain: Tensor
+        self.offset: Tensor
+        self.scale: Tensor
+        self.register_buffer("state_gain", torch.zeros(action_dim, state_dim))
+        self.register_buffer("offset", torch.zeros(action_dim))
+        self.register_buffer("scale", torch.ones(action_dim))
+
+    @classmethod
+    def fit(
+        cls, states: np.ndarray, actions: np.ndarray, targets: np.ndarray, state: Units, action: Units
+    ) -> Self:
+        """Standardise the relative actions of a dataset.
+
+        Args:
+            states: (F, d), raw.
+            actions: (F, A), raw.
+            targets: (A,), see `target_dimensions`.
+            state: Units of the states.
+            action: Units of the actions.
+        """
+        module = cls(actions.shape[1], states.shape[1])
+        for k, m in enumerate(targets):
+            if m < 0:
+                continue
+            relative = actions[:, k].astype(np.float64) - states[:, m]
+            mean, std = float(relative.mean()), float(relative.std()) or 1.0
+            gain = float(action.scale[k] / state.scale[m])
+            module.state_gain[k, m] = gain
+            module.offset[k] = float(action.scale[k]) * mean + float(action.offset[k])
+            module.offset[k] -= gain * float(state.offset[m])
+            module.scale[k] = float(action.scale[k]) * std
+        return module
+
+    def encode(self, actions: Tensor, states: Tensor) -> Tensor:
+        """What the network is to predict for actions (F, A) in states (F, d)."""
+        return (actions - self._at(states)) / self.scale
+
+    def decode(self, outputs: Tensor, states: Tensor) -> Tensor:
+        """Actions (F, A) of the network's outputs (F, A) in states (F, d)."""
+        return self._at(states) + outputs * self.scale
+
+    def _at(self, states: Tensor) -> Tensor:
+        return states @ self.state_gain.T + self.offset
