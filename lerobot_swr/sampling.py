@@ -1,6 +1,5 @@
 """The similarity-weighted sampler: draws whose style a frame teaches (algorithm 1)."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -69,7 +68,7 @@ class SimilarityWeightedSampler:
         self._distances = torch.from_numpy(distances).to(torch.float32)  # (N, N)
         self.candidates = torch.zeros(len(distances), dtype=torch.bool)
         self._largest = torch.zeros(len(distances))  # (N,) largest distance to a candidate
-        self.effective_demos = 0.0
+        self._effective_demos: float | None = None
 
     def set_candidates(self, candidates: Tensor) -> None:
         """Restrict the draw to the episodes marked in `candidates`, (N,), non-zero where marked."""
@@ -84,46 +83,52 @@ class SimilarityWeightedSampler:
         self._largest = among.amax(dim=1)
         if self.normalization == "global":
             self._largest = self._largest[self._candidate_list].amax().expand(len(marked))
-        self.effective_demos = self._effective_demos()
+        self._effective_demos = None
 
     def nu(self, i: Tensor, j: Tensor) -> Tensor:
         """ν(τ_i, τ_j) of pairs of episodes, (B,) each or broadcastable to each other."""
         largest = self._largest[i]
         return torch.where(largest > 0, self._distances[i, j] / largest, 0.0)
 
-    def draw(self, episodes: Tensor, generator: torch.Generator) -> Pairs:
+    def draw(self, episodes: Tensor, uniforms: Tensor) -> Pairs:
         """Draw a partner for every frame.
 
         Args:
             episodes: (B,) int64, episode i of each frame; all of them candidates.
-            generator: Source of the draws, on the CPU.
+            uniforms: (B,) independent numbers, uniform in [0, 1); each decides one frame's partner.
         """
         others = len(self._candidate_list) - 1
         if self.p == 0 or others < 1:
             ones = torch.ones(len(episodes), device=episodes.device)
             return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
         if self.partner_sampling == "uniform":
-            relabelled = torch.rand(len(episodes), generator=generator).to(episodes.device) < self.p
-            place = torch.randint(others, episodes.shape, generator=generator).to(episodes.device)
-            place = place + (place >= self._place[episodes])  # skips the frame's own episode
-            partners = self._candidate_list[place]
-            weights = torch.exp(-self.beta * self.nu(episodes, partners))
-            return Pairs(
-                torch.where(relabelled, partners, episodes), torch.where(relabelled, weights, 1.0), relabelled
-            )
-        # (B, M), log of each pair's share in the expectation: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i
-        log_shares = -self.beta * self.nu(episodes[:, None], self._candidate_list) + math.log(self.p / others)
-        log_own = math.log(1 - self.p) if self.p < 1 else -math.inf
-        log_shares[torch.arange(len(episodes), device=episodes.device), self._place[episodes]] = log_own
-        place = torch.multinomial(log_shares.softmax(dim=1).cpu(), 1, generator=generator).squeeze(1)
-        styles = self._candidate_list[place.to(episodes.device)]
-        return Pairs(styles, log_shares.logsumexp(dim=1).exp(), styles != episodes)
+            relabelled = uniforms < self.p
+            place = (uniforms * (others / self.p)).long().clamp_(max=others - 1)
+            place += place >= self._place[episodes]  # skips the frame's own episode
+            styles = torch.where(relabelled, self._candidate_list[place], episodes)
+            weights = torch.exp(-self.beta * self.nu(episodes, styles))
+            return Pairs(styles, weights, relabelled)
+        # (B, M), each pair's share in the expectation: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i
+        shares = torch.exp(-self.beta * self.nu(episodes[:, None], self._candidate_list)) * (self.p / others)
+        shares.scatter_(1, self._place[episodes][:, None], 1 - self.p)
+        cumulative = shares.double().cumsum(dim=1)
+        # Inverse distribution function; below 1, so that rounding never leads past the last share.
+        threshold = uniforms.double().clamp(max=1 - 1e-9)[:, None] * cumulative[:, -1:]
+        place = torch.searchsorted(cumulative, threshold, right=True).squeeze(1).clamp_(max=others)
+        styles = self._candidate_list[place]
+        return Pairs(styles, cumulative[:, -1].float(), styles != episodes)
 
-    def _effective_demos(self) -> float:
+    @property
+    def effective_demos(self) -> float:
         """Kish's effective number of demonstrations that teach a style, from 1 (its own alone) to M.
 
         (Σ_i W_ij)² / Σ_i W_ij², averaged over styles j; over an even selection of them where there are many.
         """
+        if self._effective_demos is None:
+            self._effective_demos = self._count_effective_demos()
+        return self._effective_demos
+
+    def _count_effective_demos(self) -> float:
         stride = -(-len(self._candidate_list) // MAX_INSPECTED_STYLES)
         styles = self._candidate_list[::stride]
         weights = torch.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)

@@ -110,6 +110,7 @@ def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_co
         "--policy.residual=false",
         "--policy.lr_schedule=constant",
         "--policy.style_init_scale=1.0",
+        "--policy.style_lr_scale=1.0",
         "--policy.partner_sampling=uniform",
         '--policy.normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}',
     ]

@@ -145,6 +145,9 @@ class ZBCConfig(BCConfig):
     # Standard deviation of the styles' normal initialisation. The paper's code leaves PyTorch's 1.0, which
     # needs several times more steps.
     style_init_scale: float = 0.1
+    # Learning rate of the styles, in units of optimizer_lr. A style learns from its own episode alone: with
+    # the paper's 1 it lags behind the network.
+    style_lr_scale: float = 5.0
 
     # --- Inference: which styles are drawn, one per episode of the environment ---
     # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again) or
@@ -185,6 +188,8 @@ class ZBCConfig(BCConfig):
             raise ValueError(f"style_dim={self.style_dim}: expected at least 1")
         if not self.style_init_scale >= 0:
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
+        if not self.style_lr_scale > 0:
+            raise ValueError(f"style_lr_scale={self.style_lr_scale}: expected a number > 0; the paper uses 1")
         check_style_sampling(self.style_sampling)
         selection = self.style_selection
         if self.style_interpolate is not None:
