@@ -141,10 +141,14 @@ class StepGenerator(nn.Module):
     Seed and step are buffers, so they travel with a checkpoint and a resumed run draws what the uninterrupted
     one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making
     a data loader's iterator draws from it, once more in a resumed run than in one that goes on.)
+
+    Args:
+        stream: Generators of different streams are independent of each other.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, stream: int = 0) -> None:
         super().__init__()
+        self._stream = (stream,) if stream else ()
         self.seed: Tensor
         self.step: Tensor
         self.register_buffer("seed", torch.tensor(torch.initial_seed() % 2**63))
@@ -154,9 +158,14 @@ class StepGenerator(nn.Module):
         """The generator of the next step, on the CPU."""
         distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
         process = torch.distributed.get_rank() if distributed else 0
-        entropy = np.random.SeedSequence((int(self.seed), process, int(self.step)))
+        entropy = np.random.SeedSequence((int(self.seed), process, int(self.step), *self._stream))
         self.step += 1
         return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint32)[0]))
+
+    def uniforms(self, steps: int, count: int) -> Tensor:
+        """(steps * count,) numbers in [0, 1), `count` from the generator of each of the next steps."""
+        drawn = [torch.rand(count, generator=self.next(), dtype=torch.float64) for _ in range(steps)]
+        return torch.cat(drawn)
 
 
 def check_probability(p: float) -> None:

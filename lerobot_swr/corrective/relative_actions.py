@@ -1,7 +1,6 @@
 """Actions that are targets of the state, and how a policy learns them: relative to the state."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import torch
@@ -27,11 +26,12 @@ def target_dimensions(states: np.ndarray, actions: np.ndarray, absolute: bool | 
     found = np.full(actions.shape[1], -1)
     if absolute is False:
         return found
-    for k, action in enumerate(actions.T.astype(np.float64)):
-        variance = action.var()
+    for k in range(actions.shape[1]):
+        action = actions[:, k : k + 1].astype(np.float64)  # (F, 1)
+        variance = float(action.var())
         if variance == 0:
             continue
-        removed = 1 - (action[:, None] - states).var(axis=0) / variance  # (d,)
+        removed = 1 - (action - states).var(axis=0) / variance  # (d,)
         if absolute or removed.max() >= TARGET_SHARE:
             found[k] = int(removed.argmax())
     return found
@@ -52,6 +52,10 @@ class Units:
     def normalize(self, raw: Tensor) -> Tensor:
         """Normalised numbers (F, d) of raw ones."""
         return raw * self.scale + self.offset
+
+    def to(self, device: torch.device) -> "Units":
+        """The same on a device."""
+        return Units(self.scale.to(device), self.offset.to(device))
 
 
 class RelativeActions(nn.Module):
@@ -74,11 +78,10 @@ class RelativeActions(nn.Module):
         self.register_buffer("offset", torch.zeros(action_dim))
         self.register_buffer("scale", torch.ones(action_dim))
 
-    @classmethod
     def fit(
-        cls, states: np.ndarray, actions: np.ndarray, targets: np.ndarray, state: Units, action: Units
-    ) -> Self:
-        """Standardise the relative actions of a dataset.
+        self, states: np.ndarray, actions: np.ndarray, targets: np.ndarray, state: Units, action: Units
+    ) -> None:
+        """Standardise by the relative actions of a dataset.
 
         Args:
             states: (F, d), raw.
@@ -87,18 +90,16 @@ class RelativeActions(nn.Module):
             state: Units of the states.
             action: Units of the actions.
         """
-        module = cls(actions.shape[1], states.shape[1])
         for k, m in enumerate(targets):
             if m < 0:
                 continue
             relative = actions[:, k].astype(np.float64) - states[:, m]
             mean, std = float(relative.mean()), float(relative.std()) or 1.0
-            gain = float(action.scale[k] / state.scale[m])
-            module.state_gain[k, m] = gain
-            module.offset[k] = float(action.scale[k]) * mean + float(action.offset[k])
-            module.offset[k] -= gain * float(state.offset[m])
-            module.scale[k] = float(action.scale[k]) * std
-        return module
+            scale, offset = float(action.scale[k]), float(action.offset[k])
+            gain = scale / float(state.scale[m])
+            self.state_gain[k, m] = gain
+            self.offset[k] = scale * mean + offset - gain * float(state.offset[m])
+            self.scale[k] = scale * std
 
     def encode(self, actions: Tensor, states: Tensor) -> Tensor:
         """What the network is to predict for actions (F, A) in states (F, d)."""
