@@ -20,7 +20,7 @@ from lerobot_swr.trajectories import Trajectories
 RIDGE = 1e-3  # in units of the standardised regressors' variance
 MIN_R2 = 0.8  # action dimensions that are explained less get no correction
 FOLDS = 5
-MAX_HORIZON = 30
+MAX_HORIZON = 30  # steps, and at most a quarter of an episode
 DISPLACEMENT_HORIZON = 3  # steps in which displacements lead back to the path, where the data allow it
 MAX_FRAMES = 100_000  # of evenly chosen episodes; the fit has few unknowns
 
@@ -74,12 +74,12 @@ def fit_inverse_model(
             f"dataset {name} has a single episode; corrective labels fit an inverse model and test it on "
             "held-out episodes, so they need at least 2: record more, or use --policy.corrective=none"
         )
-    longest = int(trajectories.lengths.max()) - 1
+    longest = max(1, min(MAX_HORIZON, int(trajectories.lengths.mean()) // 4))
     if horizon is not None and not 1 <= horizon <= longest:
         raise ValueError(f"corrective_horizon={horizon}: expected 1 to {longest} steps, or null")
     data = _Frames(trajectories)
     targets = target_dimensions(data.states, data.actions, absolute)
-    horizons = range(1, min(MAX_HORIZON, longest) + 1) if horizon is None else [horizon]
+    horizons = range(1, longest + 1) if horizon is None else [horizon]
     model = _choose([_fit(data, targets, h) for h in horizons])
     if not model.corrected.any():
         raise ValueError(
@@ -156,24 +156,39 @@ def _ridge(regressors: np.ndarray, explained: np.ndarray, fold: np.ndarray) -> t
         (p, q) coefficients of all frames together and (q,) R² over the held-out frames, 0 for a constant.
     """
     x_scale, y_scale = (np.where(v.std(axis=0) > 0, v.std(axis=0), 1.0) for v in (regressors, explained))
+    # Near zero mean, so that sums of products lose no digits.
     x = (regressors - regressors.mean(axis=0)) / x_scale
     y = (explained - explained.mean(axis=0)) / y_scale
+    both = np.concatenate([np.ones((len(x), 1)), x, y], axis=1)
     folds = np.unique(fold)
-    gram = np.stack([x[fold == f].T @ x[fold == f] for f in folds])  # (folds, p, p)
-    cross = np.stack([x[fold == f].T @ y[fold == f] for f in folds])  # (folds, p, q)
-    count = np.array([(fold == f).sum() for f in folds])
+    moments = np.stack([both[fold == f].T @ both[fold == f] for f in folds])  # (folds, 1 + p + q, 1 + p + q)
+    total = moments.sum(axis=0)
 
-    def solve(g: np.ndarray, c: np.ndarray, n: int) -> np.ndarray:
-        return np.linalg.solve(g / n + RIDGE * np.eye(len(g)), c / n)
+    p = x.shape[1]
+    squared, variation = np.zeros(y.shape[1]), np.zeros(y.shape[1])
+    for held_out in moments:
+        coefficients, mean = _solve(total - held_out, p)
+        about_mean = _moments_about(held_out, mean)
+        xx, xy, yy = about_mean[:p, :p], about_mean[:p, p:], np.diag(about_mean)[p:]
+        squared += yy - 2 * (coefficients * xy).sum(axis=0) + (coefficients * (xx @ coefficients)).sum(axis=0)
+        variation += yy
+    r2 = 1 - np.divide(squared, variation, out=np.ones_like(squared), where=variation > 0)
+    return _solve(total, p)[0] * y_scale / x_scale[:, None], r2
 
-    squared = np.zeros(y.shape[1])
-    for i, f in enumerate(folds):
-        kept = solve(gram.sum(axis=0) - gram[i], cross.sum(axis=0) - cross[i], count.sum() - count[i])
-        squared += np.square(y[fold == f] - x[fold == f] @ kept).sum(axis=0)
-    total = np.square(y).sum(axis=0)
-    r2 = 1 - np.divide(squared, total, out=np.ones_like(total), where=total > 0)
-    coefficients = solve(gram.sum(axis=0), cross.sum(axis=0), int(count.sum()))
-    return coefficients * y_scale / x_scale[:, None], r2
+
+def _solve(moments: np.ndarray, p: int) -> tuple[np.ndarray, np.ndarray]:
+    """(p, q) coefficients and (p + q,) means, from the sums of products of (1, x, y)."""
+    count, mean = moments[0, 0], moments[0, 1:] / moments[0, 0]
+    covariance = _moments_about(moments, mean) / count
+    return np.linalg.solve(covariance[:p, :p] + RIDGE * np.eye(p), covariance[:p, p:]), mean
+
+
+def _moments_about(moments: np.ndarray, mean: np.ndarray) -> np.ndarray:
+    """(p + q, p + q) sums of products of deviations from a mean."""
+    sums = moments[0, 1:]
+    return (
+        moments[1:, 1:] - np.outer(sums, mean) - np.outer(mean, sums) + moments[0, 0] * np.outer(mean, mean)
+    )
 
 
 def log_inverse_model(model: InverseModel, names: list[str] | None) -> None:
