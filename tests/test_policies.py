@@ -35,8 +35,7 @@ def gradients(policy, batch):
 def drawn_pairs(policy, batch):
     """The pairs that the policy's next training step will draw."""
     policy.sampler.set_candidates(policy.styles.trained)
-    generator = copy.deepcopy(policy.draws).next()
-    uniforms = torch.rand(len(batch["episode_index"]), generator=generator, dtype=torch.float64)
+    uniforms = copy.deepcopy(policy.draws).uniforms(1, len(batch["episode_index"]))
     return policy.sampler.draw(batch["episode_index"], uniforms)
 
 
