@@ -24,14 +24,15 @@ def target_dimensions(states: np.ndarray, actions: np.ndarray, absolute: bool | 
         (A,) int64, -1 where the action is no target.
     """
     found = np.full(actions.shape[1], -1)
-    if absolute is False:
+    moving = states.min(axis=0) < states.max(axis=0)
+    if absolute is False or not moving.any():
         return found
     for k in range(actions.shape[1]):
         action = actions[:, k : k + 1].astype(np.float64)  # (F, 1)
         variance = float(action.var())
         if variance == 0:
             continue
-        removed = 1 - (action - states).var(axis=0) / variance  # (d,)
+        removed = np.where(moving, 1 - (action - states).var(axis=0) / variance, -np.inf)  # (d,)
         if absolute or removed.max() >= TARGET_SHARE:
             found[k] = int(removed.argmax())
     return found

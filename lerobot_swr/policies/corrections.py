@@ -144,15 +144,18 @@ class Corrections(nn.Module):
 
 
 def _units_of(preprocessor: Any, columns: dict[str, np.ndarray]) -> dict[str, Units]:
-    """The linear maps with which LeRobot's normalisation, whichever it is, treats features."""
-    probes = {}
-    for key, column in columns.items():
-        low, high = column.min(axis=0), column.max(axis=0)
-        probes[key] = torch.from_numpy(np.stack([low, np.where(high > low, high, low + 1)]))  # (2, d)
-    normalized = preprocessor(probes)
+    """The linear maps with which LeRobot's normalisation, whichever it is, treats features.
+
+    A constant dimension is mapped to what its constant becomes.
+    """
+    ends = {
+        key: torch.from_numpy(np.stack([column.min(axis=0), column.max(axis=0)]))  # (2, d)
+        for key, column in columns.items()
+    }
+    normalized = preprocessor(ends)
     units = {}
-    for key, raw in probes.items():
-        low, high = normalized[key].double().cpu()
-        scale = (high - low) / (raw[1] - raw[0])
-        units[key] = Units(scale.float(), (low - scale * raw[0]).float())
+    for key, (low, high) in ends.items():
+        low_to, high_to = normalized[key].double().cpu()
+        scale = torch.where(high > low, (high_to - low_to) / (high - low), 0.0)
+        units[key] = Units(scale.float(), (low_to - scale * low).float())
     return units
