@@ -108,12 +108,15 @@ def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
             assert moments[k][i]["step"] == state["step"] == 1
 
 
-@pytest.mark.parametrize("policy_type", ["bc", "zbc", "wzbc"])
+@pytest.mark.parametrize(
+    ("policy_type", "options"),
+    [("bc", ()), ("zbc", ()), ("wzbc", ()), ("wzbc", ("--policy.corrective=demos",))],
+)
 def test_a_seed_is_trained_as_lerobot_train_does(
-    lerobot_train_command, swr_train, small_maze, tmp_path, policy_type
+    lerobot_train_command, swr_train, small_maze, tmp_path, policy_type, options
 ):
     """Same initial weights, frames, pairs and updates over more than an epoch; equal up to rounding."""
-    flags = [*SMALL, "--policy.flush_denormal=false"]
+    flags = [*SMALL, *options, "--policy.flush_denormal=false"]
     lerobot_train_command(*train_flags(policy_type, small_maze, tmp_path / "one", 70, *flags, "--seed=3"))
     swr_train(*train_flags(policy_type, small_maze, tmp_path / "all", 70, *flags, "--seeds=1,3", "--jobs=1"))
     expected, found = weights(tmp_path / "one", 70), weights(tmp_path / "all" / "seed_3", 70)

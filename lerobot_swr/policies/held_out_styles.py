@@ -66,7 +66,7 @@ class HeldOutStyles:
         nearest = candidates[torch.from_numpy(to_trained.argmin(axis=1)).to(candidates.device)]
         starts = policy.styles.embedding(nearest).detach()[:, None]
         frames = [policy.normalized_frames(i, self._frames(i)) for i in missing]
-        encoded, _ = encode_styles(policy.network, frames, starts, ENCODING_STEPS)
+        encoded, _ = encode_styles(policy.predict, frames, starts, ENCODING_STEPS)
         self._encoded.update(zip(missing, encoded, strict=True))
 
     def _frames(self, episode: int) -> np.ndarray:

@@ -12,7 +12,10 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.corrective.inverse_model import InverseModel
+from lerobot_swr.corrective.labels import SHARE
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.corrections import Corrections, describe_dynamics
 from lerobot_swr.policies.dataset_policy import DatasetPolicy
 from lerobot_swr.policies.held_out_styles import HeldOutStyles
 from lerobot_swr.policies.network import ActionNetwork
@@ -44,8 +47,6 @@ class BCPolicy(DatasetPolicy):
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta)
-        if config.flush_denormal:
-            torch.set_flush_denormal(True)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
 
@@ -55,12 +56,11 @@ class BCPolicy(DatasetPolicy):
 
     def _make_network(self) -> ActionNetwork:
         config = self.config
-        inputs = cast(dict, config.input_features)
         return ActionNetwork(
             config.observation_keys,
-            sum(inputs[key].shape[0] for key in config.observation_keys),
+            config.observation_dim,
             self._style_dim,
-            config.action_feature.shape[0],  # type: ignore[union-attr]
+            config.action_dim,
             config.hidden_dim,
             config.num_hidden,
             config.residual,
@@ -129,13 +129,17 @@ class BCPolicy(DatasetPolicy):
 
     # --- LeRobot's inference interface ---
 
+    def predict(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, d_k) and styles (B, style_dim)."""
+        return self.network(batch, style)
+
     def reset(self) -> None:
         """Start a rollout."""
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """(B, A) normalised actions for normalised observations (B, d)."""
-        return self.network(batch)
+        return self.predict(batch)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -151,11 +155,13 @@ class ZBCPolicy(BCPolicy):
 
     Attributes:
         styles: The cookbook {z_i}.
+        corrections: What corrective labels change; None without them.
     """
 
     config_class = ZBCConfig
     name = "zbc"
     config: ZBCConfig
+    _dynamics: InverseModel | None = None
 
     def __init__(self, config: ZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
@@ -172,6 +178,12 @@ class ZBCPolicy(BCPolicy):
             config.style_selection,
         )
         self.held_out = HeldOutStyles(self)
+        self.corrections: Corrections | None = None
+        if config.corrective != "none" or config.action_targets is not None:
+            self.corrections = Corrections(config)
+        if self.corrections is not None and self._dynamics is not None:
+            stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
+            self.corrections.adopt_dataset(config, self.trajectories, stats, self._dynamics)
         if dataset_meta is not None:
             self.styles.table = self._make_table(dataset_meta)
 
@@ -193,16 +205,45 @@ class ZBCPolicy(BCPolicy):
         That is ``style_episode`` (B,), the episode whose style it is, in training; in evaluation, where an
         episode may not have been trained on, the ``style`` (B, style_dim) itself.
         """
-        drawn, episodes = super().draw(batch, steps), batch["episode_index"]
+        episodes = batch["episode_index"]
         if not self.training:
-            return {**drawn, "style": self.held_out.styles(episodes)}
+            drawn = {**super().draw(batch, steps), "style": self.held_out.styles(episodes)}
+            return drawn if self.corrections is None else self.corrections.encode(drawn)
+        if steps > 1 and not self.styles.trained[episodes].all():
+            # Partners are episodes seen so far, which differ from step to step.
+            split = [{k: v.unflatten(0, (steps, -1))[s] for k, v in batch.items()} for s in range(steps)]
+            parts = [self.draw(one) for one in split]
+            return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         self.styles.mark_trained(episodes)
+        frames = super().draw(batch, steps)
+        drawn = self._with_styles(frames, episodes, steps)
+        if self.corrections is None:
+            return drawn
+        own = {
+            "weight": frames["weight"],
+            "style_episode": episodes,
+            "relabelled": torch.zeros_like(episodes),
+        }
+        trained = self.styles.trained[: self.config.num_episodes]
+        return self.corrections.correct(drawn, own, batch["index"], trained, steps)
+
+    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
+        """What `draw` returns, given what `BCPolicy.draw` did: every frame teaches its own style."""
         return {**drawn, "style_episode": episodes}
 
     def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B,) weighted squared error of each frame under its style; a pure function, see `BCPolicy`."""
         errors = self._action_errors(self.network(drawn, self._drawn_styles(drawn)), drawn)
         return errors * drawn["weight"]
+
+    def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
+        """Figures to log: those of corrective labels."""
+        return {} if self.corrections is None else self.corrections.figures(drawn, losses)
+
+    def predict(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, d_k) and styles (B, style_dim)."""
+        outputs = self.network(batch, style)
+        return outputs if self.corrections is None else self.corrections.decode(outputs, batch)
 
     def _drawn_styles(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B, style_dim) styles of what `draw` returned."""
@@ -242,7 +283,7 @@ class ZBCPolicy(BCPolicy):
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
         style = self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
-        return self.network(batch, style)
+        return self.predict(batch, style)
 
     # --- Checkpoints ---
 
@@ -250,6 +291,8 @@ class ZBCPolicy(BCPolicy):
         super()._adopt_dataset(meta)
         if self._new_dataset:
             self.config.num_added_styles = 0
+        if self.config.corrective != "none":
+            self._dynamics = describe_dynamics(self.config, meta, self.trajectories)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
@@ -299,6 +342,8 @@ class ZBCPolicy(BCPolicy):
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """On another dataset keep the network and start new styles."""
+        if self.corrections is not None:
+            state = self.corrections.translate_checkpoint(state, "corrections.", self._dynamics is not None)
         if not self._new_dataset:
             return state
         logger.warning(
@@ -361,28 +406,18 @@ class WZBCPolicy(ZBCPolicy):
             raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
         return keys
 
-    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
-        """As `ZBCPolicy.draw`, with the pair of each frame: its style may be another episode's.
+    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
+        """Draw the pair of each frame: its style may be another episode's.
 
         ``relabelled`` (B,) is True where it is. The mean loss has algorithm 1's expectation.
 
         Raises:
-            RuntimeError: In training, if the policy was created without a dataset.
+            RuntimeError: If the policy was created without a dataset.
         """
-        if not self.training:
-            return super().draw(batch, steps)
-        episodes = batch["episode_index"]
-        if steps > 1 and not self.styles.trained[episodes].all():
-            # Partners are episodes seen so far, which differ from step to step.
-            split = [{k: v.unflatten(0, (steps, -1))[s] for k, v in batch.items()} for s in range(steps)]
-            parts = [self.draw(one) for one in split]
-            return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         if self.sampler is None:
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
-        self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
         pairs = self.sampler.draw(episodes, self.draws.uniforms(steps, len(episodes) // steps))
-        drawn = BCPolicy.draw(self, batch, steps)
         weight = drawn["weight"] * pairs.weights
         return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
 
@@ -400,17 +435,21 @@ class WZBCPolicy(ZBCPolicy):
         mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``: the mean of W(τ_i, τ_j);
         ``effective_demos`` per style. The first three count every episode alike where the loss does, and are
         unbiased estimates, whichever way pairs are drawn: the loss is (1 - p) own_style_loss + p
-        relabelled_loss. They are defined for every batch: read their averages over time.
+        relabelled_loss. They are defined for every batch: read their averages over time. Corrective frames
+        count for ``corrective_loss`` alone.
         """
         assert self.sampler is not None
-        p, figures = self.config.p, {"effective_demos": self.sampler.effective_demos}
+        p = self.config.p
+        figures = {"effective_demos": self.sampler.effective_demos, **super().figures(drawn, losses)}
         # NumPy: torch's overhead for so few numbers would be noticeable in every step.
         values, weights = losses.cpu().numpy(), drawn["weight"].cpu().numpy()
-        share = drawn["relabelled"].cpu().numpy() / np.float32(len(values))
-        relabelled = float(values @ share)
+        relabelled = drawn["relabelled"].cpu().numpy()
+        own, share = ~relabelled, float(len(values))
+        if "corrective" in drawn:
+            own, share = own & ~drawn["corrective"].cpu().numpy(), share * (1 - SHARE)
         if p < 1:
-            figures["own_style_loss"] = (float(values.mean()) - relabelled) / (1 - p)
+            figures["own_style_loss"] = float(values @ own) / share / (1 - p)
         if p > 0:
-            figures["relabelled_loss"] = relabelled / p
-            figures["mean_weight"] = float(weights @ share) / p
+            figures["relabelled_loss"] = float(values @ relabelled) / share / p
+            figures["mean_weight"] = float(weights @ relabelled) / share / p
         return figures
