@@ -36,11 +36,13 @@ def invented_result(one: Cell, lengths: list[int], behaviors: list[str], paths: 
         rollouts[str(seed)] = {}
         for protocol, count in one.definition["protocols"].items():
             styles = [i % len(behaviors) for i in range(count)]
+            styled = "style_sampling" in one.needs.definition["config"]
             rollouts[str(seed)][protocol] = {
                 "behavior": [behaviors[i] for i in styles],
                 "success": [1] * count,
                 "length": [lengths[i] - 3 for i in styles],
-                "style": styles if "style_sampling" in one.needs.definition["config"] else [None] * count,
+                "style": styles if styled else [None] * count,
+                "match": [1 if styled else None] * count,
             }
     drawn = [paths[i % len(paths)] for i in range(count)] if one.definition["paths"] else []
     return {"rollouts": rollouts, "allowed": None, "paths": drawn}

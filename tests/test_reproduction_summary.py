@@ -12,11 +12,13 @@ DEMONSTRATED = ["a", "a", "b", "b"]
 
 def part(behavior: str, style: list[int | None], length: list[int] | None = None) -> dict:
     """Rollouts with one letter per behaviour; an x is a failure."""
+    match = [None if i is None else int(DEMONSTRATED[i] == b) for i, b in zip(style, behavior, strict=True)]
     return {
         "behavior": list(behavior),
         "success": [int(b != "x") for b in behavior],
         "length": length or [10] * len(behavior),
         "style": style,
+        "match": match,
     }
 
 

@@ -144,7 +144,7 @@ def plot_control(path: Path, demonstrations: DatasetDescription, cells: Sequence
         }
         means = [float(np.mean(by_seed)) for _, by_seed in bars.values()]
         drawn = row[4].bar(list(bars), means, color="tab:blue", width=0.6)
-        row[4].bar_label(drawn, fmt="%.2f")
+        row[4].bar_label(drawn, fmt="%.2f", label_type="center", color="white")
         for i, (_, by_seed) in enumerate(bars.values()):
             row[4].plot([i] * len(by_seed), by_seed, ".", color="0.2")
         row[4].set(ylabel="L1 to filtered training", ylim=(0, 2))

@@ -6,6 +6,7 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import path_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
@@ -51,16 +52,19 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     assert cell.needs is not None
     definition = cell.definition
     checkpoint = load_policy(checkpoint_folder(cell.needs, store, seed), protocol, definition["style_filter"])
-    load_reference(DatasetSource(root=dataset), checkpoint)  # refuses another dataset than the training's
+    # refuses another dataset than the training's
+    trajectories = load_reference(DatasetSource(root=dataset), checkpoint)
     env_cfg = environment(definition["env"])
+    rule = env_cfg.behavior_rule()
+    demonstrated = [rule(episode) for episode in trajectories.episodes()]
     count = definition["protocols"][protocol]
     # Rollout k of a training seed meets the same start and noise whatever the policy.
     env_seed = definition["seed"] * (seed + 1)
-    rollouts = run_rollouts(checkpoint, env_cfg, env_cfg.behavior_rule(), count, BATCH_SIZE, env_seed)
+    rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed)
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
     return {
-        "rollouts": _columns(rollouts),
+        "rollouts": _columns(rollouts, demonstrated, env_cfg),
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
         "paths": [short_path(path_of(env_cfg, rollout.observations)) for rollout in drawn],
     }
@@ -82,10 +86,18 @@ def load_policy(folder: Path, style_sampling: str | None, style_filter: str | No
     return load_checkpoint(config)
 
 
-def _columns(rollouts: list[Rollout]) -> dict[str, list]:
+def _columns(rollouts: list[Rollout], demonstrated: list[str], env_cfg: TaskEnvConfig) -> dict[str, list]:
+    def match(rollout: Rollout) -> int | None:
+        """Whether it shows what its style's demonstration does, as far as that lies ahead of its start."""
+        if rollout.style_episode is None:
+            return None
+        expected = env_cfg.expected_behavior(demonstrated[rollout.style_episode], rollout.observations)
+        return int(rollout.behavior == expected)
+
     return {
         "behavior": [rollout.behavior for rollout in rollouts],
         "success": [int(rollout.success) for rollout in rollouts],
         "length": [rollout.length for rollout in rollouts],
         "style": [rollout.style_episode for rollout in rollouts],
+        "match": [match(rollout) for rollout in rollouts],
     }

@@ -50,7 +50,8 @@ class Summary:
         l1_by_seed: Of each seed.
         floor: What perfect reproducers would score as the mean over as many seeds.
         success: Share of successes.
-        fidelity: Share of rollouts that show their style's demonstration's behaviour; None without styles.
+        fidelity: Share of rollouts that show their style's demonstration's behaviour (in a maze: those of its
+            doors that lie ahead of the start); None without styles.
         coverage: Mean over seeds of the share of the demonstrated behaviours that were shown.
         histogram: Label to share of all rollouts.
         outcomes: For each seed (n_rollouts, 2): success and, with styles, whether the behaviour matched.
@@ -83,8 +84,8 @@ def summarize(result: Mapping[str, Any], protocol: str, demonstrated: Sequence[s
     reference = histogram(demonstrated)
     l1_by_seed = [l1_distance(histogram(shown), reference) for shown in labels]
     allowed = result["allowed"]
-    matches = [_matches(part, demonstrated) for part in parts]
-    styled = all(part["style"][0] is not None for part in parts)
+    styled = all(part["match"][0] is not None for part in parts)
+    matches = [[int(bool(match)) for match in part["match"]] for part in parts]
     return Summary(
         protocol=protocol,
         n_seeds=len(parts),
@@ -169,10 +170,3 @@ def length_control(
 
     pooled = compare([length for of_seed in lengths for length in of_seed])
     return pooled, [compare(of_seed).l1 for of_seed in lengths]
-
-
-def _matches(part: Mapping[str, Any], demonstrated: Sequence[str]) -> list[int]:
-    return [
-        int(style is not None and demonstrated[style] == shown)
-        for shown, style in zip(part["behavior"], part["style"], strict=True)
-    ]
