@@ -104,7 +104,8 @@ def training(
 
 def variant_name(policy: str, options: Mapping[str, Any]) -> str:
     """A policy's name with what differs from its defaults."""
-    return " ".join([policy, *(f"{key}={value:g}" for key, value in options.items())])
+    values = {key: f"{value:g}" if isinstance(value, float) else value for key, value in options.items()}
+    return " ".join([policy, *(f"{key}={value}" for key, value in values.items())])
 
 
 def evaluation(

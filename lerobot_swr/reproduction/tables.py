@@ -137,8 +137,8 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
         "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
         f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
-        "they use, of its doors those ahead of the start. The paper's WZBC on only_forward, in its own maze, under its three perturbations: "
-        f"success {quoted} (which is which could not be checked)."
+        "they use, of its doors those ahead of the start. The paper's WZBC on only_forward, in its own maze, "
+        f"under its three perturbations: success {quoted} (which is which could not be checked)."
     )
     return Table(caption, header, rows)
 
