@@ -44,7 +44,7 @@ class Cell:
     """One piece of the experiments.
 
     Attributes:
-        kind: ``train``, ``evaluate``, ``styles`` or ``similarity``: who computes it.
+        kind: ``dataset``, ``train``, ``evaluate``, ``styles`` or ``similarity``: who computes it.
         labels: How it is called.
         definition: All that its result depends on, except for `needs`; plain JSON values.
         needs: The training that must be finished first.

@@ -166,8 +166,10 @@ def _robustness(settings: ReproductionSettings, demos: Demonstrations) -> Iterab
     if "wzbc" in settings.choose_policies(STACKED):
         trained += [training(settings, demos, "wzbc", options) for options in ROBUST_WZBC]
     for one in trained:
+        in_table1 = one.labels.policy in STACKED
         for name, env in CONDITIONS.items():
-            yield evaluation(settings, demos, one, name, env, paths=name == "deterministic")
+            paths = in_table1 and name == "deterministic"  # the same cell
+            yield evaluation(settings, demos, one, name, env, paths=paths)
         for radius in START_RADII:
             env = {"start": "pseudo_random", "start_radius": radius}
             if env != CONDITIONS["pseudo-random start"]:
@@ -188,7 +190,7 @@ def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
         )
     for policy in settings.choose_policies(STACKED):
         trained = training(settings, demos, policy)
-        yield evaluation(settings, demos, trained, "deterministic", paths=True)
+        yield evaluation(settings, demos, trained, "deterministic")
         if policy != "bc":
             yield evaluation(
                 settings,
