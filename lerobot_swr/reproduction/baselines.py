@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import lerobot.policies  # noqa: F401  (registers act and diffusion)
 from lerobot.configs import PreTrainedConfig
 
 from lerobot_swr.reproduction.training import STACKED
@@ -62,9 +63,9 @@ BASELINES = {
         steps="diffusion_steps",
         extra="lerobot[diffusion]",
     ),
-    "beso": Baseline({"lr_schedule": "cosine"}, batch_size=16),
-    "ddpm_gpt": Baseline({"lr_schedule": "cosine"}, batch_size=16),
-    "ddpm_act": Baseline({"lr_schedule": "cosine"}, batch_size=16),
+    "beso": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
+    "ddpm_gpt": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
+    "ddpm_act": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
 }
 
 
