@@ -1,6 +1,6 @@
 """Numbers of the paper that stand beside ours (arXiv 2504.18160v1).
 
-Only figures that could be checked are here; a missing one is shown as "–". Its mazes, demonstrations and
+Quoted are the figures that were at hand when this package was planned; the others are shown as "–". Its mazes, demonstrations and
 magnitudes of perturbation are others than ours, so the figures tell the order of magnitude and nothing more.
 """
 
@@ -17,5 +17,5 @@ TABLE1_L1: dict[tuple[str, str], float] = {
 }
 
 # Table 2: success of WZBC on only_forward under its three perturbed conditions. Which figure belongs to which
-# condition could not be checked, so tables quote them together.
+# condition is not known to us, so tables quote them together.
 ROBUSTNESS_WZBC_SUCCESS = (0.684, 0.978, 0.744)

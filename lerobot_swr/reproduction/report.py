@@ -15,7 +15,7 @@ from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults, lo
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
     "demonstrators and the sizes of the perturbations are this package's own, so the paper's numbers beside "
-    "ours tell the order of magnitude and nothing more; a dash stands where none could be checked. L1 is the "
+    "ours tell the order of magnitude and nothing more; a dash stands where we have none to quote. L1 is the "
     "distance of the behaviour histograms of rollouts and demonstrations, 0 (equal) to 2 (disjoint); failed "
     "rollouts are behaviours of their own. Drawing styles uniformly (the paper's protocol), even a perfect "
     "reproducer scores the floor; with each style used once (stratified) its L1 is 0."

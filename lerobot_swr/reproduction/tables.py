@@ -138,7 +138,7 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
         f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
         "they use, of its doors those ahead of the start. The paper's WZBC on only_forward, in its own maze, "
-        f"under its three perturbations: success {quoted} (which is which could not be checked)."
+        f"under its three perturbations: success {quoted} (which is which is not known to us)."
     )
     return Table(caption, header, rows)
 
@@ -225,7 +225,7 @@ def control(suite: SuiteResults, dataset: str) -> Table:
         f"with the floor of as many draws [central 95 %]. In band: rollouts within it, ± {TOLERANCE} steps. "
         f"{description['frames_after_end']} frames, which demonstrations record after the environment would "
         "have ended them, are added to the rollouts' lengths. The paper shows this as a figure, without "
-        "numbers that could be checked."
+        "numbers."
     )
     header = (
         "policy",
