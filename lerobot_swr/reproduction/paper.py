@@ -1,7 +1,8 @@
 """Numbers of the paper that stand beside ours (arXiv 2504.18160v1).
 
-Quoted are the figures that were at hand when this package was planned; the others are shown as "–". Its mazes, demonstrations and
-magnitudes of perturbation are others than ours, so the figures tell the order of magnitude and nothing more.
+Quoted are the figures that were at hand when this package was planned; the others are shown as "–". Its
+mazes, demonstrations and magnitudes of perturbation are others than ours, so the figures tell the order of
+magnitude and nothing more.
 """
 
 SOURCE = "Petitbois, Portelas, Lamprier, Denoyer: arXiv 2504.18160v1"
