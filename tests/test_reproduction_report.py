@@ -88,7 +88,6 @@ def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> No
         manifest = {
             "suite": suite,
             "command": f"lerobot-swr-reproduce --suite={suite}",
-            "settings": {},
             "datasets": {demos.name: store.result_path(demos.cell).name},
             "cells": [store.result_path(one).name for one in cells],
         }

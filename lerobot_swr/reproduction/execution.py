@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +68,8 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
     cells: dict[Cell, None] = {}
     for suite, datasets in suites.items():
         of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])
-        if of_suite:
-            _write_manifest(store, suite, settings, command, of_suite, [prepared[name] for name in datasets])
+        if of_suite and not settings.dry_run:
+            _write_manifest(store, suite, command, of_suite, [prepared[name] for name in datasets])
         cells.update(dict.fromkeys(of_suite))
     if not cells:
         raise ValueError(f"datasets={settings.datasets}, policies={settings.policies}: nothing to run")
@@ -202,7 +202,6 @@ def _check_policies(settings: ReproductionSettings) -> None:
 def _write_manifest(
     store: Store,
     suite: str,
-    settings: ReproductionSettings,
     command: str,
     cells: Sequence[Cell],
     datasets: Sequence[Demonstrations],
@@ -211,7 +210,6 @@ def _write_manifest(
     content = {
         "suite": suite,
         "command": command,
-        "settings": {key: str(v) if isinstance(v, Path) else v for key, v in asdict(settings).items()},
         "datasets": {demos.name: store.result_path(demos.cell).name for demos in datasets},
         "cells": [store.result_path(cell).name for cell in cells],
     }

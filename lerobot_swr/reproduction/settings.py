@@ -43,7 +43,7 @@ class ReproductionSettings:
     dataset_dir: Path | None = None
     # Trainings and evaluations that run at once, one thread each; null takes joblib's active configuration.
     jobs: int | None = os.cpu_count()
-    # Print what is done and what is waiting, and end.
+    # Make absent datasets, print what is done and what is waiting, and end.
     dry_run: bool = False
 
     def __post_init__(self) -> None:
