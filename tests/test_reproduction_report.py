@@ -150,6 +150,13 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     assert pages[0] == pages[1]
 
 
+def test_results_are_not_published_over_themselves(finished):
+    """Publishing replaces the target's results, so the source is refused as the target."""
+    with pytest.raises(ValueError, match=r"is the folder of the results itself"):
+        publish(finished, finished / ".." / finished.name)
+    assert list((finished / "results").iterdir())
+
+
 def test_the_readme_block_is_filled(finished, tmp_path):
     """Between the markers stands the table, everything else is kept; a second time changes nothing."""
     readme = tmp_path / "README.md"

@@ -19,7 +19,10 @@ def publish(source: Path, target: Path) -> None:
 
     Raises:
         FileNotFoundError: If the source has no results.
+        ValueError: If source and target are the same folder.
     """
+    if source.resolve() == target.resolve():
+        raise ValueError(f"publish={str(target)!r}: is the folder of the results itself; choose another one")
     suites = load_suites(source)
     for folder in ("results", "suites"):
         shutil.rmtree(target / folder, ignore_errors=True)
