@@ -183,15 +183,16 @@ def test_a_failed_cell_does_not_stop_the_others(settings, demos, store, trained,
     assert store.state(bad) == "done"
 
 
-def test_a_failed_training_leaves_its_measurements_waiting(settings, demos, store):
+def test_a_failed_training_leaves_its_measurements_waiting(settings, demos, store, monkeypatch):
     """The training command's log says why; what needed the policy is not attempted."""
-    broken = dataclasses.replace(demos, root=store.root / "nowhere")
+    broken = [sys.executable, "-c", "import sys; sys.exit('cannot: ' + sys.argv[1])"]
+    monkeypatch.setattr("lerobot_swr.reproduction.training._lerobot_swr_train", lambda: broken)
     trained = training(settings, demos, "zbc")
     one = evaluation(settings, demos, trained, "deterministic")
-    [failure] = run_cells([trained, one], store, {demos.name: broken}, jobs=1)
+    [failure] = run_cells([trained, one], store, {demos.name: demos}, jobs=1)
     assert failure.cell == trained
-    assert "ended with status" in failure.message
-    assert "nowhere" in failure.log.read_text()
+    assert "ended with status 1" in failure.message
+    assert "cannot: --policy.type=zbc" in failure.log.read_text()
     assert (store.state(trained), store.state(one)) == ("failed", "waiting")
 
 
