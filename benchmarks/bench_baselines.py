@@ -1,8 +1,8 @@
 """The baselines beside LeRobot's diffusion (configs/diffusion.yaml): training steps/s and actions/s.
 
 Training is `lerobot-train` with the recipes in configs/ on medium_maze-only_forward, the same batch size for
-all (the baselines noise each window of it `noise_draws` times); loading and updating are told apart. Inference
-is one environment step of 100 environments at once, in rounds that take turns.
+all (the baselines noise each window of it `noise_draws` times); loading and updating are told apart.
+Inference is one environment step of 100 environments at once, in rounds that take turns.
 """
 
 import dataclasses
