@@ -7,6 +7,7 @@ Reading order, along the way data takes:
 * `lerobot_swr.trajectories`: episodes of a dataset as arrays.
 * `lerobot_swr.similarity`, `lerobot_swr.sampling`, `lerobot_swr.styles`: the method.
 * `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies, and the baselines BESO, DDPM-GPT, DDPM-ACT.
+* `lerobot_swr.training`: many seeds at once.
 * `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports.
 * `lerobot_swr.cli`: the ``lerobot-swr-*`` commands.
 

@@ -14,6 +14,7 @@ import torch
 from lerobot.utils.constants import HF_LEROBOT_HOME
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
+from scipy.spatial.distance import squareform
 
 from lerobot_swr.trajectories import Trajectories
 
@@ -47,7 +48,7 @@ def pairwise_distances(states: Sequence[np.ndarray]) -> np.ndarray:
     n, dim = len(states), states[0].shape[1]
     longest = max(len(episode) for episode in states)
     block_length = max(1, BLOCK_ELEMENTS // (n * dim))
-    squared = torch.zeros(n, n, dtype=torch.float64)
+    squared = torch.zeros(n * (n - 1) // 2, dtype=torch.float64)  # of the pairs i < j
     for start in range(0, longest, block_length):
         stop = min(start + block_length, longest)
         padded = np.empty((n, stop - start, dim))  # (N, block, d)
@@ -55,9 +56,8 @@ def pairwise_distances(states: Sequence[np.ndarray]) -> np.ndarray:
             part = episode[start:stop]
             row[: len(part)] = part
             row[len(part) :] = episode[-1]
-        flat = torch.from_numpy(padded.reshape(n, -1))
-        squared += torch.cdist(flat, flat, compute_mode="donot_use_mm_for_euclid_dist").square_()
-    return squared.sqrt_().numpy()
+        squared += torch.pdist(torch.from_numpy(padded.reshape(n, -1))).square_()
+    return squareform(squared.sqrt_().numpy()) if n > 1 else np.zeros((1, 1))
 
 
 def _check_states(states: Sequence[np.ndarray]) -> None:

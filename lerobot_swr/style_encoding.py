@@ -1,10 +1,10 @@
 """Finds styles for demonstrations that were not trained on: the network is frozen, z is optimised."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from lerobot.utils.constants import ACTION
-from torch import Tensor, nn
+from torch import Tensor
 
 Frames = dict[str, Tensor]
 """Normalised observations (T, d_k) and ``action`` (T, A) of one episode."""
@@ -14,7 +14,10 @@ STARTS = 5  # nearest demonstrations whose styles are tried as starts
 
 
 def encode_styles(
-    network: nn.Module, episodes: Sequence[Frames], starts: Tensor, steps: int = ENCODING_STEPS
+    network: Callable[[Frames, Tensor], Tensor],
+    episodes: Sequence[Frames],
+    starts: Tensor,
+    steps: int = ENCODING_STEPS,
 ) -> tuple[Tensor, Tensor]:
     """The style of each episode under which the network imitates it best.
 

@@ -42,5 +42,5 @@ def test_the_papers_recipe_and_flags_are_the_same_policy():
     """configs/wzbc_paper.yaml and the flags of docs/method.md."""
     policy = yaml.safe_load((REPOSITORY / "configs" / "wzbc_paper.yaml").read_text())["policy"]
     flags = dict(re.findall(r"--policy\.(\w+)=(\S+)", (REPOSITORY / "docs" / "method.md").read_text()))
-    for key in ("residual", "lr_schedule", "style_init_scale", "partner_sampling"):
+    for key in ("residual", "lr_schedule", "style_init_scale", "style_lr_scale", "partner_sampling"):
         assert str(policy[key]).lower() == flags[key], key

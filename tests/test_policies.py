@@ -35,7 +35,8 @@ def gradients(policy, batch):
 def drawn_pairs(policy, batch):
     """The pairs that the policy's next training step will draw."""
     policy.sampler.set_candidates(policy.styles.trained)
-    return policy.sampler.draw(batch["episode_index"], copy.deepcopy(policy.draws).next())
+    uniforms = copy.deepcopy(policy.draws).uniforms(1, len(batch["episode_index"]))
+    return policy.sampler.draw(batch["episode_index"], uniforms)
 
 
 def reload(policy, meta, folder, **overrides):
@@ -104,7 +105,7 @@ def test_without_relabelling_wzbc_is_zbc_bit_for_bit(make_tiny_policy):
 
 def test_without_temperature_relabelled_frames_count_fully(make_tiny_policy):
     """β = 0: every weight is 1, so the mean weight is the share of relabelled frames over p."""
-    policy = make_tiny_policy("wzbc", beta=0.0, p=1.0)
+    policy = make_tiny_policy("wzbc", beta=0.0, p=1.0, balance_episodes=False)
     _, _, figures = gradients(policy, make_batch())
     assert figures["mean_weight"] == pytest.approx(1)
     assert figures["effective_demos"] == pytest.approx(6)
@@ -251,6 +252,7 @@ def test_the_papers_literal_network_is_one_flag_set():
         residual=False,
         lr_schedule="constant",
         style_init_scale=1.0,
+        style_lr_scale=1.0,
         partner_sampling="uniform",
         normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"},
         device="cpu",
@@ -292,6 +294,7 @@ def test_the_model_card_says_how_to_install_the_plugin(make_tiny_policy, monkeyp
         ("wzbc", {"similarity_normalization": "x"}, "normalization='x'"),
         ("zbc", {"style_sampling": "some"}, "style_sampling='some'"),
         ("zbc", {"style_dim": 0}, "style_dim=0"),
+        ("zbc", {"style_lr_scale": 0}, "style_lr_scale=0"),
         ("bc", {"num_hidden": 0}, "num_hidden=0"),
         ("bc", {"lr_schedule": "linear"}, "lr_schedule='linear'"),
     ],

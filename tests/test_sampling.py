@@ -13,6 +13,12 @@ DISTANCES = np.abs(np.subtract.outer(np.array([0.0, 1, 3, 7, 8]), np.array([0.0,
 GENERATOR = torch.Generator()
 
 
+def draw(sampler, episodes):
+    """Pairs from fresh uniform numbers."""
+    uniforms = torch.rand(len(episodes), generator=GENERATOR, dtype=torch.float64)
+    return sampler.draw(episodes, uniforms.numpy())
+
+
 def make_sampler(**options) -> SimilarityWeightedSampler:
     sampler = SimilarityWeightedSampler(DISTANCES, **{"beta": 2.0, "p": 1.0, **options})
     sampler.set_candidates(torch.ones(N, dtype=torch.bool))
@@ -23,7 +29,7 @@ def test_uniform_drawing_relabels_at_its_probability():
     """A relabelled frame has j ≠ i, another keeps j = i and weight 1; the share of the former is p."""
     GENERATOR.manual_seed(0)
     episodes = torch.arange(20_000) % N
-    pairs = make_sampler(p=0.3, partner_sampling="uniform").draw(episodes, GENERATOR)
+    pairs = draw(make_sampler(p=0.3, partner_sampling="uniform"), episodes)
     assert ((pairs.styles != episodes) == pairs.relabelled).all()
     assert (pairs.weights[~pairs.relabelled] == 1).all()
     assert abs(pairs.relabelled.float().mean() - 0.3) < 0.02
@@ -43,7 +49,7 @@ def test_both_ways_of_drawing_have_the_expectation_of_algorithm_1(p, normalizati
         expected = (1 - p) * float(values[i, i]) + p * relabelled
         for way in ("uniform", "weighted"):
             sampler = make_sampler(p=p, normalization=normalization, partner_sampling=way)
-            pairs = sampler.draw(torch.full((draws,), i), GENERATOR)
+            pairs = draw(sampler, torch.full((draws,), i))
             samples = pairs.weights * values[i, pairs.styles]
             assert abs(samples.mean() - expected) < 5 * samples.std() / np.sqrt(draws) + 1e-6
         # Weighted drawing leaves the loss as the only source of variance: the weight is constant.
@@ -57,14 +63,14 @@ def test_uniform_weights_equal_the_weight_matrix(normalization):
     GENERATOR.manual_seed(0)
     weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
     episodes = torch.arange(500) % N
-    pairs = make_sampler(normalization=normalization, partner_sampling="uniform").draw(episodes, GENERATOR)
+    pairs = draw(make_sampler(normalization=normalization, partner_sampling="uniform"), episodes)
     np.testing.assert_allclose(pairs.weights, weights[episodes, pairs.styles], rtol=1e-5)
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_without_temperature_every_weight_is_one(partner_sampling):
     """β = 0 is BC-like: all demonstrations teach all styles alike."""
-    pairs = make_sampler(beta=0.0, partner_sampling=partner_sampling).draw(torch.arange(1000) % N, GENERATOR)
+    pairs = draw(make_sampler(beta=0.0, partner_sampling=partner_sampling), torch.arange(1000) % N)
     torch.testing.assert_close(pairs.weights, torch.ones(1000))
 
 
@@ -74,15 +80,15 @@ def test_only_candidates_are_drawn_and_normalise(partner_sampling):
     GENERATOR.manual_seed(0)
     sampler = make_sampler(partner_sampling=partner_sampling)
     sampler.set_candidates(torch.tensor([1, 0, 1, 1, 0]))
-    pairs = sampler.draw(torch.tensor([0, 2, 3]).repeat(300), GENERATOR)
+    pairs = draw(sampler, torch.tensor([0, 2, 3]).repeat(300))
     assert set(pairs.styles.tolist()) == {0, 2, 3}
-    assert float(sampler.nu(torch.tensor(0), torch.tensor(3))) == 1.0
+    assert float(sampler.nu(np.array(0), np.array(3))) == 1.0
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_a_huge_temperature_gives_zero_weights_and_no_nan(partner_sampling):
     """β where exp(−β) underflows leaves relabelled frames with weight 0, not with NaN."""
-    pairs = make_sampler(beta=1e6, partner_sampling=partner_sampling).draw(torch.arange(50) % N, GENERATOR)
+    pairs = draw(make_sampler(beta=1e6, partner_sampling=partner_sampling), torch.arange(50) % N)
     assert (pairs.weights == 0).all()
 
 
@@ -90,7 +96,7 @@ def test_a_single_candidate_keeps_its_frames():
     """With nobody else to teach, frames keep their own style."""
     sampler = make_sampler()
     sampler.set_candidates(torch.tensor([0, 1, 0, 0, 0]))
-    pairs = sampler.draw(torch.tensor([1, 1]), GENERATOR)
+    pairs = draw(sampler, torch.tensor([1, 1]))
     assert pairs.styles.tolist() == [1, 1]
     assert not pairs.relabelled.any()
 

@@ -69,7 +69,7 @@ def test_held_out_episodes_are_scored_with_an_encoded_style(make_tiny_policy):
     policy.train()
     policy.forward({**make_batch(), "episode_index": torch.arange(32) % 4})
     policy.eval()
-    frames = policy._normalized_frames(5)
+    frames = policy.normalized_frames(5, np.arange(policy.trajectories.lengths[5]))
     held_out = {**frames, "episode_index": torch.full((len(frames["action"]),), 5)}
     nearest = int(policy.distances()[5, :4].argmin())
     borrowed = {**held_out, "episode_index": torch.full_like(held_out["episode_index"], nearest)}

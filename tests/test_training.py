@@ -74,21 +74,24 @@ def test_training_figures_are_logged(lerobot_train_command, small_maze, tmp_path
 def test_two_processes_train_one_cookbook(small_maze, tmp_path):
     """Two processes (DDP): the saved checkpoint knows every episode that either process saw.
 
-    Started with torchrun: ``accelerate launch --cpu --num_processes=2`` starts a single process on one
-    machine.
+    With pairs and with corrective labels, which draw from the episodes seen so far. Started with torchrun:
+    ``accelerate launch --cpu --num_processes=2`` starts a single process on one machine.
     """
     output_dir = tmp_path / "run"
     command = [
         *("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"),
         str(Path(sys.executable).with_name("lerobot-train")),
-        *train_flags("wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5"),
+        *train_flags("wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5", "--policy.corrective=demos"),
     ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     run = subprocess.run([sys.executable, *command], env=environment, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr[-3000:]
     policy = load(output_dir)
     assert policy.styles.trained.all()
-    assert "Effective batch size: 8 x 2 = 16" in run.stdout + run.stderr
+    logged = run.stdout + run.stderr
+    assert "Effective batch size: 8 x 2 = 16" in logged
+    assert re.search(r"held-out R² of the action: dx [01]\.\d+, dy [01]\.\d+", logged)
+    assert "corrective_loss:" in logged
 
 
 def test_resuming_on_another_dataset_is_refused(lerobot_train_command, small_maze, tmp_path):
@@ -110,6 +113,7 @@ def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_co
         "--policy.residual=false",
         "--policy.lr_schedule=constant",
         "--policy.style_init_scale=1.0",
+        "--policy.style_lr_scale=1.0",
         "--policy.partner_sampling=uniform",
         '--policy.normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}',
     ]

@@ -28,7 +28,13 @@ from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, path_of, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
-from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.checkpoint import (
+    Checkpoint,
+    DatasetSource,
+    load_checkpoint,
+    load_demonstrations,
+    load_reference,
+)
 from lerobot_swr.evaluation.counterfactual import format_counterfactual, run_counterfactual
 from lerobot_swr.evaluation.length_control import (
     evaluate_length_control,
@@ -36,7 +42,9 @@ from lerobot_swr.evaluation.length_control import (
     frames_after_end,
 )
 from lerobot_swr.evaluation.offline import KINDS, format_offline, frame_errors, summarize
+from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
+from lerobot_swr.evaluation.robustness import format_robustness, run_robustness
 from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactual, plot_length_control
 from lerobot_swr.styles import check_style_sampling
 from lerobot_swr.trajectories import Trajectories
@@ -52,6 +60,8 @@ class EvalCommand:
     env: EnvConfig | None = None
     # Give the checkpoint as --policy.path=FOLDER; other --policy.* flags override its configuration.
     policy: PreTrainedConfig | None = None
+    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback.
+    baseline: str | None = None
     # Number of rollouts.
     n_episodes: int = 100
     # Largest number of environments that run at once.
@@ -64,6 +74,9 @@ class EvalCommand:
     counterfactual: int = 0
     # Blend this many pairs of styles of the same behaviour, and of different ones, instead. 0 does not.
     blend: int = 0
+    # Roll out n_episodes times under every perturbation of the environment instead: success, style match and
+    # length error, with each style equally often.
+    robustness: bool = False
     # [shortest, longest] in frames: compare the rollouts' lengths with the demonstrations' in this band.
     length_band: list[int] | None = None
     # Labels episodes: module:function; null takes the environment's own rule.
@@ -81,21 +94,13 @@ class EvalCommand:
         Raises:
             ValueError: Naming the offending key and value.
         """
-        path = parser.get_path_arg("policy")
-        if not path:
-            raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
-        if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
-            raise ValueError(
-                f"policy.path={path!r}: no config.json in this folder; "
-                "give a checkpoint's pretrained_model folder"
-            )
-        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
-        self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
-        self.policy.pretrained_path = Path(path)
+        if self.robustness and self.style_sampling is None:
+            self.style_sampling = "stratified"
         if self.style_sampling is not None:
             check_style_sampling(self.style_sampling)
-            if hasattr(self.policy, "style_sampling"):
-                self.policy.style_sampling = self.style_sampling
+        self._find_policy()
+        if self.robustness and self.env is None:
+            raise ValueError("robustness=true: name the environment with --env.type=...")
         if self.length_band is not None and len(self.length_band) != 2:
             raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
         for key in ("counterfactual", "blend"):
@@ -107,6 +112,34 @@ class EvalCommand:
         if self.output_dir is None:
             self.output_dir = Path("outputs/swr_eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}"
 
+    def _find_policy(self) -> None:
+        path = parser.get_path_arg("policy")
+        if self.baseline is not None:
+            if self.baseline != "playback":
+                raise ValueError(f"baseline={self.baseline!r}: expected 'playback'")
+            if path:
+                raise ValueError(
+                    f"baseline={self.baseline!r} takes the place of a policy: leave out --policy.path"
+                )
+            if self.env is None or self.blend:
+                raise ValueError(
+                    f"baseline={self.baseline!r} has no styles to blend and acts in an environment: give "
+                    "--env.type=... and leave out --blend"
+                )
+            return
+        if not path:
+            raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
+        if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
+            raise ValueError(
+                f"policy.path={path!r}: no config.json in this folder; "
+                "give a checkpoint's pretrained_model folder"
+            )
+        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+        self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        self.policy.pretrained_path = Path(path)
+        if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
+            self.policy.style_sampling = self.style_sampling
+
     @classmethod
     def __get_path_fields__(cls) -> list[str]:
         """Keys that LeRobot's parser loads from a folder."""
@@ -116,11 +149,9 @@ class EvalCommand:
 @parser.wrap()
 def evaluate(cfg: EvalCommand) -> None:
     """Evaluate a checkpoint by rollouts, or offline without an environment."""
-    assert cfg.policy is not None
     assert cfg.output_dir is not None
-    checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
-    trajectories = load_reference(cfg.dataset, checkpoint)
-    title = f"{cfg.policy.type} on {Path(trajectories.name).name}"
+    checkpoint, trajectories = _load(cfg)
+    title = f"{checkpoint.policy.config.type} on {Path(trajectories.name).name}"
     if cfg.env is None:
         errors = frame_errors(checkpoint, trajectories, cfg.dataset.episodes, cfg.seed)
         offline = summarize(errors)
@@ -130,6 +161,13 @@ def evaluate(cfg: EvalCommand) -> None:
         print(f"{title}\n{format_offline(offline)}\nwritten to {cfg.output_dir}")
         return
 
+    if cfg.robustness:
+        robustness = run_robustness(
+            checkpoint, trajectories, cfg.env, _rule(cfg), cfg.n_episodes, cfg.batch_size, cfg.seed
+        )
+        write_json(cfg.output_dir / "robustness.json", robustness, _provenance(cfg))
+        print(f"{title}\n{format_robustness(robustness)}\nwritten to {cfg.output_dir}")
+        return
     if cfg.counterfactual or cfg.blend:
         _steer(cfg, checkpoint, trajectories, title)
         return
@@ -166,6 +204,14 @@ def evaluate(cfg: EvalCommand) -> None:
         plot_length_control(cfg.output_dir / "length_control.png", control, f"{title}: L1 {control.l1:.3f}")
         print(format_length_control(control))
     print(f"written to {cfg.output_dir}")
+
+
+def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
+    if cfg.policy is None:
+        trajectories = load_demonstrations(cfg.dataset.metadata())
+        return playback_checkpoint(trajectories, cfg.style_sampling or "uniform"), trajectories  # type: ignore[arg-type]
+    checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
+    return checkpoint, load_reference(cfg.dataset, checkpoint)
 
 
 def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories, title: str) -> None:
@@ -208,8 +254,8 @@ def _provenance(cfg: EvalCommand) -> dict[str, Any]:
     """What it takes to make a result again."""
     return {
         "command": " ".join(["lerobot-swr-eval", *sys.argv[1:]]),
-        "policy_path": str(cfg.policy.pretrained_path),  # type: ignore[union-attr]
-        "policy": draccus.encode(cfg.policy, PreTrainedConfig),
+        "policy_path": None if cfg.policy is None else str(cfg.policy.pretrained_path),
+        "policy": cfg.baseline if cfg.policy is None else draccus.encode(cfg.policy, PreTrainedConfig),
         "env": None if cfg.env is None else draccus.encode(cfg.env, EnvConfig),
         "dataset": draccus.encode(cfg.dataset),
         "seed": cfg.seed,

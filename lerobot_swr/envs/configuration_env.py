@@ -4,6 +4,7 @@ import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -42,6 +43,19 @@ class TaskEnvConfig(EnvConfig):
         Demonstrations may go on recording where an environment ends the episode.
         """
         return len(observations["observation.state"])
+
+    def expected_behavior(self, requested: str, observations: Mapping[str, np.ndarray]) -> str:
+        """What an episode has to show of a requested behaviour, given where it started.
+
+        Args:
+            requested: Label of a demonstration.
+            observations: The episode's.
+        """
+        return requested
+
+    def perturbations(self) -> dict[str, dict[str, Any]]:
+        """Ways of making the task harder, for robustness evaluations: name to the options that it sets."""
+        return {}
 
     def draw_scene(self, axes: Axes) -> None:
         """Draw what does not move (walls, obstacles) behind the paths; by default nothing."""

@@ -21,6 +21,7 @@ from lerobot_swr.evaluation.metrics import (
     l1_distance,
     l1_floor,
     l1_interval,
+    median_interval,
     style_fidelity,
     success_entropy,
     success_interval,
@@ -44,7 +45,12 @@ class BehaviorResult:
         l1_floor_band: The central 95 % of that.
         coverage: Share of the demonstrated behaviours that were shown.
         entropy: Of the successful rollouts' behaviours, in units of the log of their number in the dataset.
-        style_fidelity: Share of rollouts with the behaviour of the demonstration whose style was used.
+        style_fidelity: Share of rollouts with the behaviour of the demonstration whose style was used (in a
+            maze: of its doors those ahead of the start).
+        style_fidelity_interval: Its Wilson 95 % interval.
+        length_error: Median difference in length of a rollout to the demonstration whose style was used, in
+            steps, over successful rollouts with its behaviour.
+        length_error_interval: Its bootstrap 95 % interval.
         histogram: Label to share of the rollouts.
         reference_histogram: Label to share of the demonstrations.
         episodes: One record per rollout.
@@ -61,6 +67,9 @@ class BehaviorResult:
     coverage: float
     entropy: float
     style_fidelity: float | None
+    style_fidelity_interval: Interval | None
+    length_error: float | None
+    length_error_interval: Interval | None
     histogram: Histogram
     reference_histogram: Histogram
     episodes: list[dict[str, Any]]
@@ -72,6 +81,8 @@ def evaluate_behaviors(
     style_sampling: str | None,
     reference_episodes: Sequence[int] | None = None,
     drawn_episodes: Sequence[int] | None = None,
+    demonstrated_lengths: Sequence[int] | None = None,
+    env_cfg: EnvConfig | None = None,
 ) -> BehaviorResult:
     """Compare rollouts with demonstrations.
 
@@ -82,6 +93,8 @@ def evaluate_behaviors(
         style_sampling: How styles were drawn; None for a policy without styles.
         reference_episodes: The episodes that make up the reference histogram; None takes all.
         drawn_episodes: The episodes whose styles may be drawn, for the floor; None takes the reference's.
+        demonstrated_lengths: Steps of every episode of the dataset, for the length error; None leaves it out.
+        env_cfg: Tells what a rollout has to show of a requested behaviour, given its start; None: all of it.
     """
     labels = [rollout.behavior for rollout in rollouts]
     successes = [rollout.success for rollout in rollouts]
@@ -96,6 +109,17 @@ def evaluate_behaviors(
     )
     styled = [r for r in rollouts if r.style_episode is not None and r.style_episode < len(demonstrated)]
     requested = [demonstrated[r.style_episode] for r in styled if r.style_episode is not None]
+    if isinstance(env_cfg, TaskEnvConfig):
+        requested = [
+            env_cfg.expected_behavior(label, r.observations)
+            for label, r in zip(requested, styled, strict=True)
+        ]
+    matches = [r.behavior == wanted for r, wanted in zip(styled, requested, strict=True)]
+    length_errors = [
+        abs(r.length - demonstrated_lengths[r.style_episode])
+        for r, match in zip(styled, matches, strict=True)
+        if demonstrated_lengths is not None and r.style_episode is not None and r.success and match
+    ]
     return BehaviorResult(
         style_sampling=style_sampling,
         n_episodes=len(rollouts),
@@ -108,6 +132,9 @@ def evaluate_behaviors(
         coverage=coverage(labels, reference_histogram),
         entropy=success_entropy(labels, successes, len(reference_histogram)),
         style_fidelity=style_fidelity([r.behavior for r in styled], requested) if styled else None,
+        style_fidelity_interval=success_interval(matches) if styled else None,
+        length_error=float(np.median(length_errors)) if length_errors else None,
+        length_error_interval=median_interval(length_errors) if length_errors else None,
         histogram=histogram(labels),
         reference_histogram=reference_histogram,
         episodes=[
@@ -169,10 +196,25 @@ def compare(
         drawn = [episode for episode in allowed if episode < len(demonstrated)] or None
     chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
     return Comparison(
-        evaluate_behaviors(rollouts, demonstrated, sampling, reference_episodes, drawn),
+        evaluate_behaviors(
+            rollouts,
+            demonstrated,
+            sampling,
+            reference_episodes,
+            drawn,
+            steps_to_end(env_cfg, trajectories),
+            env_cfg,
+        ),
         [(path_of(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
         [(path_of(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
     )
+
+
+def steps_to_end(env_cfg: EnvConfig, trajectories: Trajectories) -> list[int]:
+    """Steps of every demonstration until the environment would have ended it."""
+    if isinstance(env_cfg, TaskEnvConfig):
+        return [env_cfg.steps_to_end(episode) for episode in trajectories.episodes()]
+    return trajectories.lengths.tolist()
 
 
 def path_of(env_cfg: EnvConfig, observations: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -207,6 +249,9 @@ def format_result(result: BehaviorResult) -> str:
         ("entropy", f"{result.entropy:.3f}", "of successes, in log(number of demonstrated behaviours)"),
         ("style fidelity", fidelity, "rollouts that show their style's demonstration's behaviour"),
     ]
+    if result.length_error is not None and result.length_error_interval is not None:
+        bounds = interval(result.length_error_interval)
+        rows.append(("length error", f"{result.length_error:.1f}", f"{bounds} bootstrap 95 %, median, steps"))
     lines = [f"{name:<15} {value:>7}  {note}" for name, value, note in rows]
     lines.append(f"{'behaviour':<24} {'demos':>6} {'rollouts':>8}")
     for label in {**result.reference_histogram, **result.histogram}:

@@ -6,7 +6,7 @@ from typing import Any
 
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
-from lerobot.policies import PreTrainedPolicy, make_pre_post_processors
+from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
 from lerobot.utils.constants import OBS_STATE
 
@@ -57,12 +57,12 @@ class Checkpoint:
     """A trained policy, ready to act.
 
     Attributes:
-        policy: In evaluation mode.
+        policy: In evaluation mode; a LeRobot policy, or what acts like one.
         preprocessor: Observations to the policy's inputs.
         postprocessor: The policy's outputs to actions.
     """
 
-    policy: PreTrainedPolicy
+    policy: Any
     preprocessor: Any
     postprocessor: Any
 
@@ -98,6 +98,11 @@ def load_checkpoint(config: PreTrainedConfig, rename_map: dict[str, str] | None 
     return Checkpoint(policy, preprocessor, postprocessor)
 
 
+def load_demonstrations(meta: LeRobotDatasetMetadata) -> Trajectories:
+    """A dataset's observations and actions, without pictures."""
+    return load_trajectories(meta, [key for key, ft in meta.features.items() if _is_low_dimensional(key, ft)])
+
+
 def load_reference(source: DatasetSource, checkpoint: Checkpoint) -> Trajectories:
     """The demonstrations that a checkpoint is compared with: observations and, where present, actions.
 
@@ -114,7 +119,7 @@ def load_reference(source: DatasetSource, checkpoint: Checkpoint) -> Trajectorie
         raise ValueError(
             f"dataset.root={str(meta.root)!r} lacks {absent}, which the policy looks at; it has {keys}"
         )
-    trajectories = load_trajectories(meta, keys)
+    trajectories = load_demonstrations(meta)
     known = getattr(config, "dataset_fingerprint", None)
     if checkpoint.has_styles and known is not None:
         if len(trajectories) != config.num_episodes:

@@ -142,3 +142,9 @@ def coverage(labels: Sequence[str], reference: Mapping[str, float]) -> float:
 def style_fidelity(labels: Sequence[str], requested: Sequence[str]) -> float:
     """Share of rollouts that show the behaviour of the demonstration whose style they used."""
     return float(np.mean([shown == wanted for shown, wanted in zip(labels, requested, strict=True)]))
+
+
+def median_interval(values: Sequence[float]) -> Interval:
+    """Bootstrap 95 % interval of a median."""
+    drawn = np.random.default_rng(0).choice(np.asarray(values, float), size=(BOOTSTRAP_DRAWS, len(values)))
+    return Interval(*np.quantile(np.median(drawn, axis=1), [0.025, 0.975]).tolist())

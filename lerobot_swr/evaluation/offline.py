@@ -137,7 +137,7 @@ def _squared_errors(
             assert isinstance(policy, ZBCPolicy)
             used = torch.from_numpy(styles[start : start + BATCH]).to(batch[OBS_STATE].device)
             style = policy.styles.embedding(used)
-        parts.append((policy.network(batch, style) - batch[ACTION]).square().cpu().numpy())
+        parts.append((policy.predict(batch, style) - batch[ACTION]).square().cpu().numpy())
     return np.concatenate(parts)
 
 

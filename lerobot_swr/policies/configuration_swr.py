@@ -68,6 +68,21 @@ class ZBCConfig(BCConfig):
     # Standard deviation of the styles' normal initialisation. The paper's code leaves PyTorch's 1.0, which
     # needs several times more steps.
     style_init_scale: float = 0.1
+    # Learning rate of the styles, in units of optimizer_lr. A style learns from its own episode alone: with
+    # the paper's 1 it lags behind the network.
+    style_lr_scale: float = 5.0
+
+    # --- Corrective labels: beyond the paper, see docs/contracting.md ---
+    # Teach every style the way back to its demonstration, from states beside it: "none" (the paper), "noise"
+    # (its own states with noise; for states of few dimensions) or "demos" (states of other demonstrations).
+    corrective: str = "none"
+    # How far beside: the largest noise, or the distance at which other demonstrations' states become rare, as
+    # a share of each state dimension's range. More is more robust and keeps the timing less well.
+    corrective_scale: float = 0.1
+    # Steps in which a corrective action leads back; null takes them from the data.
+    corrective_horizon: int | None = None
+    # Whether actions are targets of the state, to be learned relative to it; null asks the data.
+    corrective_relative: bool | None = None
 
     # --- Inference: which styles are drawn, one per episode of the environment ---
     # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again) or
@@ -92,6 +107,15 @@ class ZBCConfig(BCConfig):
     # Further columns: module:function, or several separated by commas; a column has its function's name.
     style_metrics: str | None = None
 
+    # --- Set from the dataset by corrective labels; not meant to be given ---
+    # Steps in which a corrective action leads back.
+    inverse_horizon: int | None = None
+    # Held-out R² of the inverse model for each action dimension; below 0.8 it is not corrected.
+    inverse_r2: list[float] | None = None
+    # State dimension whose target each action dimension is, -1 for none; the network then predicts actions
+    # relative to the state.
+    action_targets: list[int] | None = None
+
     # --- Set by lerobot-swr-styles --add; not meant to be given ---
     # Number of styles that were encoded for episodes of other datasets, after those of the training dataset.
     num_added_styles: int = 0
@@ -108,7 +132,13 @@ class ZBCConfig(BCConfig):
             raise ValueError(f"style_dim={self.style_dim}: expected at least 1")
         if not self.style_init_scale >= 0:
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
+        if not self.style_lr_scale > 0:
+            raise ValueError(f"style_lr_scale={self.style_lr_scale}: expected a number > 0; the paper uses 1")
         check_style_sampling(self.style_sampling)
+        if self.corrective not in ("none", "noise", "demos"):
+            raise ValueError(f"corrective={self.corrective!r}: expected 'none', 'noise' or 'demos'")
+        if not self.corrective_scale > 0:
+            raise ValueError(f"corrective_scale={self.corrective_scale}: expected a number > 0, e.g. 0.1")
         selection = self.style_selection
         if self.style_interpolate is not None:
             if len(self.style_interpolate) != 3 or any(i != int(i) for i in self.style_interpolate[:2]):

@@ -7,34 +7,28 @@ from typing import Any, Self, cast
 
 import numpy as np
 import torch
-from lerobot.configs import parser
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.corrective.inverse_model import InverseModel
+from lerobot_swr.corrective.labels import SHARE
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.corrections import Corrections, describe_dynamics
+from lerobot_swr.policies.dataset_policy import DatasetPolicy
+from lerobot_swr.policies.held_out_styles import HeldOutStyles
 from lerobot_swr.policies.network import ActionNetwork
-from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
-from lerobot_swr.policies.state_policy import StatePolicy
 from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import cached_distances
-from lerobot_swr.style_encoding import Frames, encode_styles
 from lerobot_swr.style_selection import StyleSelection
-from lerobot_swr.style_table import OUTCOMES, StyleTable, load_style_table, make_style_table
+from lerobot_swr.style_table import StyleTable, load_style_table, make_style_table
 from lerobot_swr.styles import StyleCookbook
-from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 logger = logging.getLogger(__name__)
 
-# The held-out loss encodes episodes in the middle of training, so it spends less than
-# `lerobot-swr-styles --add`.
-HELD_OUT_ENCODING_STEPS = 100
-HELD_OUT_FRAMES = 64  # per episode, evenly spread over it
-HELD_OUT_CHUNK = 32  # episodes encoded at once
 
-
-class BCPolicy(StatePolicy):
+class BCPolicy(DatasetPolicy):
     """Behaviour cloning: a deterministic policy fitted by squared error.
 
     Args:
@@ -52,12 +46,7 @@ class BCPolicy(StatePolicy):
     config: BCConfig
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
-        super().__init__(config)
-        self._trajectories: Trajectories | None = None
-        self._dataset_meta: LeRobotDatasetMetadata | None = None
-        self._new_dataset = False
-        if dataset_meta is not None:
-            self._adopt_dataset(dataset_meta)
+        super().__init__(config, dataset_meta)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
 
@@ -77,23 +66,6 @@ class BCPolicy(StatePolicy):
             config.residual,
         )
 
-    def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
-        """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
-        config = self.config
-        outcomes = [key for key in OUTCOMES if key in meta.features]
-        self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION, *outcomes])
-        self._dataset_meta = meta
-        fingerprint = self._trajectories.fingerprint([OBS_STATE])
-        known = config.dataset_fingerprint
-        self._new_dataset = known is not None and known != fingerprint
-        if self._new_dataset and parser.parse_arg("resume") in ("true", "True", "yes", "1"):
-            raise ValueError(
-                f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
-                f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
-                "original dataset, or fine-tune on this one with --policy.path instead of --resume"
-            )
-        config.num_episodes, config.dataset_fingerprint = len(self._trajectories), fingerprint
-
     def _balance_weights(self) -> Tensor | None:
         """(N,) mean length / length of each episode: uniform frames become uniform episodes."""
         if not self.config.balance_episodes or self._trajectories is None:
@@ -108,7 +80,7 @@ class BCPolicy(StatePolicy):
         return self.parameters()
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
-        """Training loss of a batch of frames.
+        """Training loss of a batch of frames: `draw`, then `frame_losses`.
 
         Args:
             batch: Normalised observations (B, d), ``action`` (B, A) and ``episode_index`` (B,).
@@ -117,15 +89,38 @@ class BCPolicy(StatePolicy):
         Returns:
             The loss, scalar or (B,), and figures to log.
         """
-        losses, figures = self.frame_losses(batch)
-        if self._episode_weights is not None:
-            self._episode_weights = self._episode_weights.to(losses.device)
-            losses = losses * self._episode_weights[batch["episode_index"]]
+        drawn = self.draw(batch)
+        losses = self.frame_losses(drawn)
+        figures = self.figures(drawn, losses.detach()) if self.training else {}
         return (losses if reduction == "none" else losses.mean()), figures
 
-    def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """(B,) loss of each frame, before episodes are balanced, and figures to log."""
-        return self._action_errors(self.network(batch), batch), {}
+    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
+        """What the loss of a batch is computed from, all random draws and bookkeeping included.
+
+        Args:
+            batch: As in `forward`; the frames of consecutive steps may come together, one after the other.
+            steps: Number of steps whose frames these are, as many of each.
+
+        Returns:
+            Observations (B, d_k), ``action`` (B, A) and ``weight`` (B,), the factor of each frame's loss.
+        """
+        keys = [*self.config.observation_keys, ACTION]
+        return {**{key: batch[key] for key in keys}, "weight": self.frame_weights(batch["episode_index"])}
+
+    def frame_weights(self, episodes: Tensor) -> Tensor:
+        """(B,) factors that let uniformly drawn frames of the (B,) `episodes` count every episode alike."""
+        if self._episode_weights is None:
+            return torch.ones(len(episodes), device=episodes.device)
+        self._episode_weights = self._episode_weights.to(episodes.device)
+        return self._episode_weights[episodes]
+
+    def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
+        """(B,) weighted loss of each frame; a pure function of the parameters and of what `draw` returned."""
+        return self._action_errors(self.network(drawn), drawn) * drawn["weight"]
+
+    def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
+        """Figures to log about what `draw` returned and the (B,) losses of `frame_losses`."""
+        return {}
 
     @staticmethod
     def _action_errors(predicted: Tensor, batch: dict[str, Tensor]) -> Tensor:
@@ -134,13 +129,17 @@ class BCPolicy(StatePolicy):
 
     # --- LeRobot's inference interface ---
 
+    def predict(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, d_k) and styles (B, style_dim)."""
+        return self.network(batch, style)
+
     def reset(self) -> None:
         """Start a rollout."""
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """(B, A) normalised actions for normalised observations (B, d)."""
-        return self.network(batch)
+        return self.predict(batch)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -156,11 +155,13 @@ class ZBCPolicy(BCPolicy):
 
     Attributes:
         styles: The cookbook {z_i}.
+        corrections: What corrective labels change; None without them.
     """
 
     config_class = ZBCConfig
     name = "zbc"
     config: ZBCConfig
+    _dynamics: InverseModel | None = None
 
     def __init__(self, config: ZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
@@ -176,7 +177,13 @@ class ZBCPolicy(BCPolicy):
             config.style_sampling,  # type: ignore[arg-type]
             config.style_selection,
         )
-        self._held_out: dict[int, Tensor] = {}
+        self.held_out = HeldOutStyles(self)
+        self.corrections: Corrections | None = None
+        if config.corrective != "none" or config.action_targets is not None:
+            self.corrections = Corrections(config)
+        if self.corrections is not None and self._dynamics is not None:
+            stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
+            self.corrections.adopt_dataset(config, self.trajectories, stats, self._dynamics)
         if dataset_meta is not None:
             self.styles.table = self._make_table(dataset_meta)
 
@@ -184,67 +191,69 @@ class ZBCPolicy(BCPolicy):
     def _style_dim(self) -> int:
         return self.config.style_dim
 
-    def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """(B,) squared error of each frame under its own episode's style.
+    def get_optim_params(self) -> Any:
+        """The network's parameters, and the styles with a learning rate of their own."""
+        rate = self.config.optimizer_lr * self.config.style_lr_scale
+        return [
+            {"params": list(self.network.parameters())},
+            {"params": list(self.styles.parameters()), "lr": rate},
+        ]
 
-        In evaluation mode an episode that was not trained on has no style: the one that `held_out_styles`
-        encodes takes its place.
+    def draw(self, batch: dict[str, Tensor], steps: int = 1) -> dict[str, Tensor]:
+        """As `BCPolicy.draw`, with the style of each frame.
+
+        That is ``style_episode`` (B,), the episode whose style it is, in training; in evaluation, where an
+        episode may not have been trained on, the ``style`` (B, style_dim) itself.
         """
         episodes = batch["episode_index"]
-        if self.training:
-            self.styles.mark_trained(episodes)
-            style = self.styles.embedding(episodes)
-        else:
-            style = self.held_out_styles(episodes)
-        return self._action_errors(self.network(batch, style), batch), {}
+        if not self.training:
+            drawn = {**super().draw(batch, steps), "style": self.held_out.styles(episodes)}
+            return drawn if self.corrections is None else self.corrections.encode(drawn)
+        if steps > 1 and not self.styles.trained[episodes].all():
+            # Partners are episodes seen so far, which differ from step to step.
+            split = [{k: v.unflatten(0, (steps, -1))[s] for k, v in batch.items()} for s in range(steps)]
+            parts = [self.draw(one) for one in split]
+            return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+        self.styles.mark_trained(episodes)
+        frames = super().draw(batch, steps)
+        drawn = self._with_styles(frames, episodes, steps)
+        if self.corrections is None:
+            return drawn
+        own = {
+            "weight": frames["weight"],
+            "style_episode": episodes,
+            "relabelled": torch.zeros_like(episodes),
+        }
+        trained = self.styles.trained[: self.config.num_episodes]
+        return self.corrections.correct(drawn, own, batch["index"], trained, steps)
 
-    def held_out_styles(self, episodes: Tensor) -> Tensor:
-        """(B, style_dim) styles of the (B,) `episodes`, encoded where they were not trained.
+    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
+        """What `draw` returns, given what `BCPolicy.draw` did: every frame teaches its own style."""
+        return {**drawn, "style_episode": episodes}
 
-        The held-out loss of ``--dataset.eval_split`` thus tells how well *some* style of the policy explains
-        an unseen demonstration. Every held-out episode is encoded once per evaluation, from the style of the
-        nearest trained one; its z is fitted to frames all over it.
+    def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
+        """(B,) weighted squared error of each frame under its style; a pure function, see `BCPolicy`."""
+        errors = self._action_errors(self.network(drawn, self._drawn_styles(drawn)), drawn)
+        return errors * drawn["weight"]
 
-        Raises:
-            RuntimeError: If the policy was created without a dataset.
-        """
-        trained = self.styles.trained.bool()
-        styles = self.styles.embedding(episodes).clone()
-        missing = [i for i in episodes[~trained[episodes]].unique().tolist() if i not in self._held_out]
-        if missing:
-            # Evaluation goes through the episodes in order: the next ones are encoded along, at little cost.
-            following = (~trained[: self.config.num_episodes]).nonzero().squeeze(1).tolist()
-            following = [i for i in following if i > missing[-1] and i not in self._held_out]
-            missing = missing + following[: max(0, HELD_OUT_CHUNK - len(missing))]
-            candidates = trained[: self.config.num_episodes].nonzero().squeeze(1)
-            to_trained = self.distances()[np.ix_(missing, candidates.cpu().numpy())]
-            nearest = candidates[torch.from_numpy(to_trained.argmin(axis=1)).to(candidates.device)]
-            starts = self.styles.embedding(nearest).detach()[:, None]
-            frames = [self._normalized_frames(i) for i in missing]
-            encoded, _ = encode_styles(self.network, frames, starts, HELD_OUT_ENCODING_STEPS)
-            self._held_out.update(zip(missing, encoded, strict=True))
-        for place, episode in enumerate(episodes.tolist()):
-            if episode in self._held_out:
-                styles[place] = self._held_out[episode]
-        return styles
+    def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
+        """Figures to log: those of corrective labels."""
+        return {} if self.corrections is None else self.corrections.figures(drawn, losses)
+
+    def predict(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, d_k) and styles (B, style_dim)."""
+        outputs = self.network(batch, style)
+        return outputs if self.corrections is None else self.corrections.decode(outputs, batch)
+
+    def _drawn_styles(self, drawn: dict[str, Tensor]) -> Tensor:
+        """(B, style_dim) styles of what `draw` returned."""
+        return drawn["style"] if "style" in drawn else self.styles.embedding(drawn["style_episode"])
 
     def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation; training again makes encoded styles out of date."""
         if mode:
-            self._held_out = {}
+            self.held_out.forget()
         return super().train(mode)
-
-    def _normalized_frames(self, episode: int) -> Frames:
-        """At most `HELD_OUT_FRAMES` frames of an episode, as batches bring them."""
-        assert self._trajectories is not None
-        assert self._dataset_meta is not None
-        preprocessor, _ = make_bc_pre_post_processors(self.config, self._dataset_meta.stats)
-        count = min(HELD_OUT_FRAMES, int(self._trajectories.lengths[episode]))
-        chosen = np.linspace(0, self._trajectories.lengths[episode] - 1, count).round().astype(int)
-        columns = self._trajectories.episode(episode)
-        keys = [*self.config.observation_keys, ACTION]
-        frames = preprocessor({key: torch.from_numpy(columns[key][chosen]) for key in keys})
-        return {key: frames[key] for key in keys}
 
     def distances(self) -> np.ndarray:
         """(N, N) distances of the training dataset's episodes over the features that ν compares.
@@ -253,21 +262,16 @@ class ZBCPolicy(BCPolicy):
             RuntimeError: If the policy was created without a dataset.
             ValueError: If a feature to compare is unknown.
         """
-        if self._trajectories is None or self._dataset_meta is None:
-            raise RuntimeError(
-                "distances between episodes need the dataset: create the policy with dataset_meta"
-            )
-        return cached_distances(self._trajectories, self.compared_keys(), Path(self._dataset_meta.root))
+        return cached_distances(self.trajectories, self.compared_keys(), self.dataset_root)
 
     def compared_keys(self) -> Sequence[str]:
         """The features over which ν compares demonstrations."""
         return self.config.observation_keys
 
     def _make_table(self, meta: LeRobotDatasetMetadata) -> StyleTable:
-        assert self._trajectories is not None
         rule = dataset_behavior_rule(self.config.behavior_rule, meta.robot_type)
         metrics = load_style_metrics(self.config.style_metrics)
-        return make_style_table(self._trajectories, self.distances(), rule, metrics)
+        return make_style_table(self.trajectories, self.distances(), rule, metrics)
 
     def reset(self) -> None:
         """Start a rollout: the next action draws new styles, one per environment."""
@@ -279,7 +283,7 @@ class ZBCPolicy(BCPolicy):
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
         style = self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
-        return self.network(batch, style)
+        return self.predict(batch, style)
 
     # --- Checkpoints ---
 
@@ -287,6 +291,8 @@ class ZBCPolicy(BCPolicy):
         super()._adopt_dataset(meta)
         if self._new_dataset:
             self.config.num_added_styles = 0
+        if self.config.corrective != "none":
+            self._dynamics = describe_dynamics(self.config, meta, self.trajectories)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
@@ -336,6 +342,8 @@ class ZBCPolicy(BCPolicy):
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """On another dataset keep the network and start new styles."""
+        if self.corrections is not None:
+            state = self.corrections.translate_checkpoint(state, "corrections.", self._dynamics is not None)
         if not self._new_dataset:
             return state
         logger.warning(
@@ -398,32 +406,50 @@ class WZBCPolicy(ZBCPolicy):
             raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
         return keys
 
-    def frame_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
-        """(B,) weighted loss of each frame under its pair's style, whose mean has algorithm 1's expectation.
+    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
+        """Draw the pair of each frame: its style may be another episode's.
 
-        Figures to log: ``own_style_loss``, the mean squared error of frames under their own style;
-        ``relabelled_loss``, the mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``,
-        the mean of W(τ_i, τ_j); and ``effective_demos`` per style. The first three are unbiased estimates,
-        whichever way pairs are drawn, and defined for every batch: read their averages over time.
+        ``relabelled`` (B,) is True where it is. The mean loss has algorithm 1's expectation.
+
+        Raises:
+            RuntimeError: If the policy was created without a dataset.
         """
-        if not self.training:
-            return super().frame_losses(batch)
         if self.sampler is None:
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
-        episodes = batch["episode_index"]
-        self.styles.mark_trained(episodes)
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
-        pairs = self.sampler.draw(episodes, self.draws.next())
-        style = self.styles.embedding(pairs.styles)
-        style = torch.where(pairs.relabelled[:, None], style.detach(), style)
-        losses = self._action_errors(self.network(batch, style), batch) * pairs.weights
+        pairs = self.sampler.draw(episodes, self.draws.uniforms(steps, len(episodes) // steps))
+        weight = drawn["weight"] * pairs.weights
+        return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
 
+    def _drawn_styles(self, drawn: dict[str, Tensor]) -> Tensor:
+        """(B, style_dim) styles; relabelled ones send no gradient into the cookbook (algorithm 1)."""
+        style = super()._drawn_styles(drawn)
+        if "relabelled" not in drawn:
+            return style
+        return torch.where(drawn["relabelled"].unsqueeze(-1), style.detach(), style)
+
+    def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
+        """Figures to log.
+
+        ``own_style_loss``: the mean squared error of frames under their own style; ``relabelled_loss``: the
+        mean of W(τ_i, τ_j) times the error under another style; ``mean_weight``: the mean of W(τ_i, τ_j);
+        ``effective_demos`` per style. The first three count every episode alike where the loss does, and are
+        unbiased estimates, whichever way pairs are drawn: the loss is (1 - p) own_style_loss + p
+        relabelled_loss. They are defined for every batch: read their averages over time. Corrective frames
+        count for ``corrective_loss`` alone.
+        """
+        assert self.sampler is not None
         p = self.config.p
-        figures = {"effective_demos": self.sampler.effective_demos}
-        with torch.no_grad():
-            if p < 1:
-                figures["own_style_loss"] = (losses * ~pairs.relabelled).mean().item() / (1 - p)
-            if p > 0:
-                figures["relabelled_loss"] = (losses * pairs.relabelled).mean().item() / p
-                figures["mean_weight"] = (pairs.weights * pairs.relabelled).mean().item() / p
-        return losses, figures
+        figures = {"effective_demos": self.sampler.effective_demos, **super().figures(drawn, losses)}
+        # NumPy: torch's overhead for so few numbers would be noticeable in every step.
+        values, weights = losses.cpu().numpy(), drawn["weight"].cpu().numpy()
+        relabelled = drawn["relabelled"].cpu().numpy()
+        own, share = ~relabelled, float(len(values))
+        if "corrective" in drawn:
+            own, share = own & ~drawn["corrective"].cpu().numpy(), share * (1 - SHARE)
+        if p < 1:
+            figures["own_style_loss"] = float(values @ own) / share / (1 - p)
+        if p > 0:
+            figures["relabelled_loss"] = float(values @ relabelled) / share / p
+            figures["mean_weight"] = float(weights @ relabelled) / share / p
+        return figures

@@ -83,10 +83,10 @@ def add_demonstrations(
     encoded, errors, nearest_errors = [], [], []
     for i in range(0, len(frames), CHUNK):
         part = slice(i, i + CHUNK)
-        found = encode_styles(policy.network, frames[part], starts[part])
+        found = encode_styles(policy.predict, frames[part], starts[part])
         encoded.append(found[0])
         errors.append(found[1])
-        nearest_errors.append(encode_styles(policy.network, frames[part], starts[part, :1], steps=0)[1])
+        nearest_errors.append(encode_styles(policy.predict, frames[part], starts[part, :1], steps=0)[1])
 
     first = len(styles)
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))

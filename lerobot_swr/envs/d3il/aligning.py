@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from lerobot_swr.envs.d3il.layouts import (
     BOX_POSITION_RANGE,
     TARGET_POSITION_RANGE,
 )
+from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.d3il.scene import new_scene
 
 _START_ARM = (*ALIGNING_START_JOINTS, 0.0, 0.0)  # the fingers start closed
@@ -85,22 +86,42 @@ class AligningEnv(ArmTask):
     **Behaviour**: `lerobot_swr.envs.d3il.behavior.aligning_behavior`.
 
     Source: Jia et al., ICLR 2024. Version 0: first.
+
+    Args:
+        render_mode: `rgb_array` or None.
+        render_height: Of the pictures, in pixels.
+        render_width: Of the pictures, in pixels.
+        start_radius: See `ArmPerturbations`.
+        action_noise: See `ArmPerturbations`.
+        box_push: See `ArmPerturbations`.
     """
 
     task = "aligning"
     task_description = ALIGNING_DESCRIPTION
 
-    def __init__(self, render_mode: str | None = None, render_height: int = 480, render_width: int = 640):
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        render_height: int = 480,
+        render_width: int = 640,
+        start_radius: float = 0.0,
+        action_noise: float = 0.0,
+        box_push: float = 0.0,
+    ):
         super().__init__(
             model=aligning_model(),
             start_tool=ALIGNING_START_TOOL,
             n_axes=3,
             environment_state_size=len(ALIGNING_SCENE_NAMES),
+            perturbations=ArmPerturbations(start_radius, action_noise, box_push),
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
         )
         self._box = self._simulation.data.joint("box").qpos
+        self._box_velocity = self._simulation.data.joint("box").qvel
+        self._push: tuple[int, np.ndarray] | None = None
+        self._steps = 0
         self._target = np.zeros(7)
 
     def _begin_episode(self, options: dict[str, Any]) -> None:
@@ -108,6 +129,15 @@ class AligningEnv(ArmTask):
         target = _given_pose(options, "target") or _draw_pose(self.np_random, TARGET_POSITION_RANGE)
         self._target[:] = target.pose
         self._simulation.reset(np.concatenate([_START_ARM, box.pose]), marker=self._target)
+        self._push = self._perturbations.draw_push(_FLOOR_FRICTION[0], self.np_random)
+        self._steps = 0
+
+    def step(self, action: np.ndarray) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """As `ArmTask.step`; the push, if any, comes first."""
+        if self._push is not None and self._steps == self._push[0]:
+            self._box_velocity[:2] += self._push[1]
+        self._steps += 1
+        return super().step(action)
 
     def _scene_state(self) -> np.ndarray:
         return np.concatenate([self._box, self._target]).astype(np.float32)

@@ -8,6 +8,7 @@ import numpy as np
 
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, FPS
+from lerobot_swr.envs.d3il.perturbations import SETTLING_STEPS, ArmPerturbations
 from lerobot_swr.envs.d3il.rendering import OffscreenCamera
 from lerobot_swr.envs.d3il.simulation import ArmSimulation
 
@@ -26,6 +27,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         start_tool: (3,) tool position in the start pose, which is also the first desired position.
         n_axes: How many coordinates of the desired position the actions change (2: xy, 3: xyz).
         environment_state_size: Length of the observation's ``environment_state``.
+        perturbations: How episodes differ from the benchmark's.
         render_mode: ``"rgb_array"`` or None.
         render_height: Of the pictures, in pixels.
         render_width: Of the pictures, in pixels.
@@ -41,6 +43,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         start_tool: tuple[float, float, float],
         n_axes: int,
         environment_state_size: int,
+        perturbations: ArmPerturbations,
         render_mode: str | None,
         render_height: int,
         render_width: int,
@@ -51,6 +54,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         self._picture_size = (render_height, render_width)
         self._camera: OffscreenCamera | None = None
         self._simulation = ArmSimulation(model)
+        self._perturbations = perturbations
         self._start_tool = np.array(start_tool)
         self._desired = self._start_tool.copy()
         self._n_axes = n_axes
@@ -69,6 +73,11 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         super().reset(seed=seed)
         self._desired = self._start_tool.copy()
         self._begin_episode(options or {})
+        shift = self._perturbations.draw_shift(self.np_random)
+        if shift.any():
+            self._desired += shift
+            for _ in range(SETTLING_STEPS):
+                self._simulation.advance(self._desired)
         return self._observation(), self._info()
 
     def step(self, action: np.ndarray) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -79,6 +88,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
                 f"action={action!r}: the {self.task} task takes {self._n_axes} finite numbers, the change of "
                 "the desired tool position in metres"
             )
+        action = self._perturbations.disturb(action, self.np_random)
         self._desired[: self._n_axes] += np.clip(action, -ACTION_LIMIT_M, ACTION_LIMIT_M)
         self._simulation.advance(self._desired)
         self._judge()

@@ -17,6 +17,7 @@ from lerobot_swr.envs.d3il.layouts import (
     FINISH_LINE_Y,
     OBSTACLES,
 )
+from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.d3il.scene import TABLE_TOP_Z, new_scene
 
 _START_QPOS = np.array([*AVOIDING_START_JOINTS, 0.0, 0.0])  # the fingers start closed
@@ -37,7 +38,8 @@ class AvoidingEnv(ArmTask):
     **Action** (2): change of the desired tool x, y in metres per step, clipped to +-0.05. The desired height
     stays 0.122 m. One step is 35 ms; demonstrations move 5 to 9 mm per step.
 
-    **Start**: always the same pose, tool at (0.525, -0.280); `seed` and `options` change nothing.
+    **Start**: always the same pose, tool at (0.525, -0.280); `seed` and `options` change nothing, unless a
+    perturbation draws from the seed.
 
     **Reward**: 1 on reaching the finish line, else 0.
 
@@ -50,17 +52,32 @@ class AvoidingEnv(ArmTask):
     **Behaviour**: `lerobot_swr.envs.d3il.behavior.avoiding_behavior`.
 
     Source: Jia et al., ICLR 2024. Version 0: first.
+
+    Args:
+        render_mode: `rgb_array` or None.
+        render_height: Of the pictures, in pixels.
+        render_width: Of the pictures, in pixels.
+        start_radius: See `ArmPerturbations`.
+        action_noise: See `ArmPerturbations`.
     """
 
     task = "avoiding"
     task_description = AVOIDING_DESCRIPTION
 
-    def __init__(self, render_mode: str | None = None, render_height: int = 480, render_width: int = 640):
+    def __init__(
+        self,
+        render_mode: str | None = None,
+        render_height: int = 480,
+        render_width: int = 640,
+        start_radius: float = 0.0,
+        action_noise: float = 0.0,
+    ):
         super().__init__(
             model=avoiding_model(),
             start_tool=AVOIDING_START_TOOL,
             n_axes=2,
             environment_state_size=len(AVOIDING_SCENE),
+            perturbations=ArmPerturbations(start_radius, action_noise),
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,

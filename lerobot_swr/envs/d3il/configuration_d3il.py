@@ -6,6 +6,7 @@ Importing this module needs neither MuJoCo nor numba; making an environment does
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -29,6 +30,7 @@ from lerobot_swr.envs.d3il.layouts import (
     OBSTACLES,
     TARGET_POSITION_RANGE,
 )
+from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
 
 GYM_IDS = {"avoiding": "lerobot_swr/D3IL-Avoiding-v0", "aligning": "lerobot_swr/D3IL-Aligning-v0"}
@@ -60,6 +62,14 @@ class D3ILEnvConfig(TaskEnvConfig):
     # Step limit of an episode; default: the benchmark's, 250 for avoiding and 400 for aligning.
     episode_length: int | None = None
 
+    # Half the side of the square in which the tool's start is drawn, around its usual place, in metres.
+    start_radius: float = 0.0
+    # Standard deviation of the noise on each coordinate of every action, in metres; demonstrations move 5 to
+    # 9 mm per step (avoiding), up to 9 mm (aligning).
+    action_noise: float = 0.0
+    # Once per episode the box is pushed so that, standing free, it slides this far, in metres (aligning).
+    box_push: float = 0.0
+
     # Size of the rendered picture, in pixels.
     render_height: int = 480
     render_width: int = 640
@@ -83,6 +93,9 @@ class D3ILEnvConfig(TaskEnvConfig):
         """
         if self.task not in GYM_IDS:
             raise ValueError(f"task={self.task!r}: the d3il environment knows {', '.join(GYM_IDS)}")
+        if self.box_push and self.task != "aligning":
+            raise ValueError(f"box_push={self.box_push}: the {self.task} task has no box")
+        ArmPerturbations(self.start_radius, self.action_noise, self.box_push)
         if self.episode_length is None:
             self.episode_length = EPISODE_LENGTHS[self.task]
         if self.episode_length < 1:
@@ -102,16 +115,32 @@ class D3ILEnvConfig(TaskEnvConfig):
     @property
     def gym_kwargs(self) -> dict:
         """Arguments for `gymnasium.make`."""
+        push = {"box_push": self.box_push} if self.task == "aligning" else {}
         return {
             "render_mode": self.render_mode,
             "render_height": self.render_height,
             "render_width": self.render_width,
+            "start_radius": self.start_radius,
+            "action_noise": self.action_noise,
+            **push,
             "max_episode_steps": self.episode_length,
         }
 
     def behavior_rule(self) -> BehaviorRule:
         """Avoiding: the gaps taken, like ``top-mid-bottom``. Aligning: ``inside`` or ``outside``."""
         return avoiding_behavior if self.task == "avoiding" else aligning_behavior
+
+    def perturbations(self) -> dict[str, dict[str, Any]]:
+        """Shifted starts, noisy actions and, for aligning, a pushed box."""
+        found: dict[str, dict[str, Any]] = {
+            "start ±2 cm": {"start_radius": 0.02},
+            "start ±4 cm": {"start_radius": 0.04},
+            "action noise 2 mm": {"action_noise": 0.002},
+            "action noise 4 mm": {"action_noise": 0.004},
+        }
+        if self.task == "aligning":
+            found |= {"box pushed 2 cm": {"box_push": 0.02}, "box pushed 5 cm": {"box_push": 0.05}}
+        return found
 
     def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
         """(T, 2) path in the table's plane as pictures show it, y to the right: the tool's or the box's."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -112,6 +113,26 @@ class Maze2DEnvConfig(TaskEnvConfig):
         """Actions until the first state in the goal disc."""
         reached = in_goal(observations[OBS_STATE], get_layout(self.task or ""))
         return int(reached.argmax()) if reached.any() else len(reached)
+
+    def expected_behavior(self, requested: str, observations: Mapping[str, np.ndarray]) -> str:
+        """The requested checkpoints that lie ahead: a start beyond a wall leaves that wall's door out."""
+        layout = get_layout(self.task or "")
+        y = observations[OBS_STATE][0, 1]
+        ahead = {str(d.checkpoint) for wall in layout.walls if wall.y >= y for d in wall.doors} | {"0"}
+        return "".join(checkpoint for checkpoint in requested if checkpoint in ahead)
+
+    def perturbations(self) -> dict[str, dict[str, Any]]:
+        """Shifted and random starts, noise on every displacement, walls that hold the agent."""
+        return {
+            "start ±0.10": {"start": "pseudo_random", "start_radius": 0.10},
+            "start ±0.20": {"start": "pseudo_random", "start_radius": 0.20},
+            "start anywhere": {"start": "random"},
+            "noise 0.5": {"transition_noise": 0.5},
+            "noise 1": {"transition_noise": 1.0},
+            "noise 2": {"transition_noise": 2.0},
+            "sticky walls": {"sticky_walls": True},
+            "sticky, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
+        }
 
     def draw_scene(self, axes: Axes) -> None:
         """Walls, door numbers and the goal."""

@@ -1,0 +1,36 @@
+"""``lerobot-swr-train``: ``lerobot-train`` for several seeds at once.
+
+Examples:
+    lerobot-swr-train --seeds=0,1,2,3,4 --policy.type=wzbc --policy.device=cpu --policy.push_to_hub=false \
+        --dataset.repo_id=local/only_forward --dataset.root=data/only_forward \
+        --batch_size=16 --steps=100000 --output_dir=outputs/train/wzbc
+    # interrupted? The same command goes on with --resume=true
+"""
+
+import re
+import sys
+
+from lerobot.configs import parser
+from lerobot.utils.import_utils import register_third_party_plugins
+from lerobot.utils.utils import init_logging
+
+from lerobot_swr.cli.errors import explain_errors
+from lerobot_swr.training import SeedsTrainConfig, train_seeds
+
+
+@parser.wrap()
+def train(cfg: SeedsTrainConfig) -> None:
+    """Train, and print where the policies are."""
+    cfg.validate()
+    for folder in train_seeds(cfg):
+        print(folder)
+
+
+@explain_errors
+def main() -> None:
+    """Entry point."""
+    init_logging()
+    register_third_party_plugins()
+    # `--seeds=0,1,2` as a list, which LeRobot's parser wants in brackets
+    sys.argv = [re.sub(r"^--seeds=(\d+(,\d+)*)$", r"--seeds=[\1]", flag) for flag in sys.argv]
+    train()

@@ -1,0 +1,87 @@
+"""Playback with feedback: the baseline without a network.
+
+It plays a demonstration back and corrects deviations as corrective labels do: the action at the nearest frame
+of the chosen demonstration, plus J times the distance to it. What a policy with corrective labels gains over
+it is that it needs no demonstrations when it acts.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from lerobot.utils.constants import OBS_STATE
+from torch import Tensor, nn
+
+from lerobot_swr.corrective.feedback import Feedback
+from lerobot_swr.corrective.inverse_model import fit_inverse_model
+from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.styles import StyleCookbook, StyleSampling
+from lerobot_swr.trajectories import Trajectories
+
+
+@dataclass(frozen=True)
+class PlaybackConfig:
+    """What evaluations read of a policy's configuration.
+
+    Attributes:
+        style_sampling: How demonstrations are drawn.
+        type: Name of the baseline.
+        device: Where it computes.
+    """
+
+    style_sampling: StyleSampling
+    type: str = "playback"
+    device: str = "cpu"
+
+
+class PlaybackPolicy(nn.Module):
+    """Plays one demonstration per rollout back, with feedback; all in raw units.
+
+    Attributes:
+        config: See `PlaybackConfig`.
+        styles: Draws the demonstrations; the styles themselves are empty.
+        feedback: The demonstrations and their inverse model.
+
+    Args:
+        trajectories: The demonstrations.
+        style_sampling: How they are drawn, as a policy draws its styles.
+
+    Raises:
+        ValueError: If no inverse model fits them, see `fit_inverse_model`.
+    """
+
+    def __init__(self, trajectories: Trajectories, style_sampling: StyleSampling = "uniform"):
+        super().__init__()
+        self.config = PlaybackConfig(style_sampling)
+        self.feedback = Feedback(trajectories, fit_inverse_model(trajectories))
+        self.styles = StyleCookbook(len(trajectories), 0, 0.0, style_sampling)
+        self.styles.trained.fill_(1)
+        self._matched: Tensor | None = None
+
+    def reset(self) -> None:
+        """Start a rollout: the next action draws one demonstration per environment."""
+        self.styles.end_rollout()
+        self._matched = None
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, A) raw actions for raw observations (B, d).
+
+        The frame is looked for in the whole demonstration at first, then near the last one.
+        """
+        states = batch[OBS_STATE].float()
+        self.styles.active_styles(len(states))
+        assert self.styles.active is not None
+        paths = self.feedback.paths
+        if self._matched is None:
+            self._matched = paths.nearest_of_episode(states, self.styles.active)
+        else:
+            self._matched = paths.nearest(states, self._matched)
+        return self.feedback.act(states, self._matched)
+
+
+def playback_checkpoint(trajectories: Trajectories, style_sampling: StyleSampling = "uniform") -> Checkpoint:
+    """The baseline in the place of a trained policy; observations and actions stay as they are."""
+    return Checkpoint(
+        PlaybackPolicy(trajectories, style_sampling), lambda batch: batch, lambda action: action
+    )

@@ -1,0 +1,89 @@
+"""What policies that look at their whole training dataset share: reading it, telling it from another."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from lerobot.configs import parser
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.utils.constants import ACTION, OBS_STATE
+
+from lerobot_swr.policies.configuration_swr import BCConfig
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
+from lerobot_swr.policies.state_policy import StatePolicy
+from lerobot_swr.style_encoding import Frames
+from lerobot_swr.style_table import OUTCOMES
+from lerobot_swr.trajectories import Trajectories, load_trajectories
+
+
+class DatasetPolicy(StatePolicy):
+    """A policy that looks at its whole dataset when it is created.
+
+    Args:
+        config: The policy's configuration.
+        dataset_meta: Metadata of the training dataset; given when the policy is trained, absent at inference.
+
+    Raises:
+        ValueError: If the dataset lacks ``observation.state`` or ``action`` or holds NaN, or if a resumed
+            run's dataset is not the checkpoint's.
+    """
+
+    config_class = BCConfig
+    name = "dataset"  # LeRobot wants one of every class; policies have their own
+    config: BCConfig
+
+    def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None):
+        super().__init__(config)
+        self._trajectories: Trajectories | None = None
+        self._dataset_meta: LeRobotDatasetMetadata | None = None
+        self._new_dataset = False
+        if dataset_meta is not None:
+            self._adopt_dataset(dataset_meta)
+
+    def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
+        """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
+        config = self.config
+        outcomes = [key for key in OUTCOMES if key in meta.features]
+        self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION, *outcomes])
+        self._dataset_meta = meta
+        fingerprint = self._trajectories.fingerprint([OBS_STATE])
+        known = config.dataset_fingerprint
+        self._new_dataset = known is not None and known != fingerprint
+        if self._new_dataset and parser.parse_arg("resume") in ("true", "True", "yes", "1"):
+            raise ValueError(
+                f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
+                f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
+                "original dataset, or fine-tune on this one with --policy.path instead of --resume"
+            )
+        config.num_episodes, config.dataset_fingerprint = len(self._trajectories), fingerprint
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """The training dataset.
+
+        Raises:
+            RuntimeError: If the policy was created without one.
+        """
+        if self._trajectories is None:
+            raise RuntimeError("this needs the training dataset: create the policy with dataset_meta")
+        return self._trajectories
+
+    def normalized_frames(self, episode: int, frames: np.ndarray) -> Frames:
+        """Some frames of an episode of the training dataset, as batches bring them."""
+        assert self._dataset_meta is not None
+        preprocessor, _ = make_bc_pre_post_processors(self.config, self._dataset_meta.stats)
+        columns = self.trajectories.episode(episode)
+        keys = [*self.config.observation_keys, ACTION]
+        batch = preprocessor({key: torch.from_numpy(columns[key][frames]) for key in keys})
+        return {key: batch[key] for key in keys}
+
+    @property
+    def dataset_root(self) -> Path:
+        """Folder of the training dataset.
+
+        Raises:
+            RuntimeError: If the policy was created without one.
+        """
+        _ = self.trajectories
+        assert self._dataset_meta is not None
+        return Path(self._dataset_meta.root)

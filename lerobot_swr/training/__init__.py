@@ -1,0 +1,13 @@
+"""Training of many seeds at once.
+
+* `configuration_training`: LeRobot's training configuration, with seeds.
+* `frame_order`: which frames a seed sees at which step, the same as in ``lerobot-train``.
+* `flat_parameters`, `traced_gradients`, `stacked_policies`: policies of one configuration trained as one.
+* `seed_runs`: runs on disk, their checkpoints, resuming.
+* `seed_training`: the loop, spread over processes.
+"""
+
+from lerobot_swr.training.configuration_training import SeedsTrainConfig
+from lerobot_swr.training.seed_training import train_seeds
+
+__all__ = ["SeedsTrainConfig", "train_seeds"]

@@ -1,0 +1,86 @@
+"""LeRobot's training configuration, with several seeds."""
+
+import copy
+import os
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import draccus
+from lerobot.configs.train import TrainPipelineConfig
+
+from lerobot_swr.policies.configuration_swr import BCConfig
+
+DECISIVE = ("dataset", "policy", "batch_size", "steps", "optimizer", "scheduler", "rename_map")
+
+
+@dataclass
+class SeedsTrainConfig(TrainPipelineConfig):
+    """Options of ``lerobot-swr-train``: those of ``lerobot-train``, and the seeds."""
+
+    # One run is trained for each, as `lerobot-train --seed=…` would, into output_dir/seed_<seed>.
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2, 3, 4])
+    # Processes over which the seeds are spread; null takes one per core.
+    jobs: int | None = None
+
+    def validate(self) -> None:
+        """Check the values and fill in defaults.
+
+        Raises:
+            ValueError: For an option that only ``lerobot-train`` has, or a bad value.
+            FileExistsError: If the output folder exists and ``resume`` is not set.
+        """
+        # LeRobot resumes one run from its config_path; this command finds its runs in output_dir.
+        new_run = self._as_plain(resume=False, output_dir=None)
+        new_run.validate()
+        filled = ["policy", "optimizer", "scheduler", "job_name"]
+        for key in filled if self.output_dir else [*filled, "output_dir"]:
+            setattr(self, key, getattr(new_run, key))
+        assert self.output_dir is not None
+        if not self.resume and self.output_dir.is_dir():
+            raise FileExistsError(
+                f"output_dir={str(self.output_dir)!r} exists; go on with its runs with --resume=true, or "
+                "choose another folder"
+            )
+        if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
+            raise ValueError(f"seeds={self.seeds}: expected different numbers >= 0, e.g. --seeds=0,1,2,3,4")
+        if self.jobs is None:
+            self.jobs = os.cpu_count() or 1
+        for key in ("jobs", "steps", "batch_size"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+        self._refuse_what_is_not_stacked()
+
+    def _refuse_what_is_not_stacked(self) -> None:
+        if not isinstance(self.policy, BCConfig):
+            kind = "a reward model" if self.policy is None else f"policy.type={self.policy.type!r}"
+            raise ValueError(f"{kind}: this command trains bc, zbc and wzbc; use lerobot-train")
+        refused = {
+            "dataset.streaming": self.dataset.streaming,
+            "eval_steps": self.eval_steps > 0,
+            "env": self.env is not None and self.env_eval_freq > 0,
+            "wandb.enable": self.wandb.enable,
+            "policy.push_to_hub": self.policy.push_to_hub,
+            "save_checkpoint_to_hub": self.save_checkpoint_to_hub,
+            "peft": self.peft is not None,
+            "sample_weighting": self.sample_weighting is not None,
+            "job": self.job.is_remote,
+        }
+        given = [key for key, is_given in refused.items() if is_given]
+        if given:
+            raise ValueError(
+                f"{', '.join(given)}: not available when several seeds are trained at once; switch off "
+                "(for env: --env_eval_freq=0, and evaluate afterwards), or use lerobot-train"
+            )
+
+    def of_seed(self, seed: int) -> TrainPipelineConfig:
+        """The configuration of one seed's run, as ``lerobot-train`` would have it."""
+        assert self.output_dir is not None
+        return self._as_plain(seed=seed, output_dir=self.output_dir / f"seed_{seed}", resume=False)
+
+    def _as_plain(self, **changes: Any) -> TrainPipelineConfig:
+        values = {f.name: copy.deepcopy(getattr(self, f.name)) for f in fields(TrainPipelineConfig) if f.init}
+        return TrainPipelineConfig(**{**values, **changes})
+
+    def decisive_options(self) -> dict[str, Any]:
+        """The options that the trained weights depend on, encoded."""
+        return {key: draccus.encode(getattr(self, key)) for key in DECISIVE}

@@ -1,0 +1,157 @@
+"""The runs of several seeds on disk: one ordinary LeRobot run per seed."""
+
+import json
+import logging
+import os
+import shutil
+from pathlib import Path
+
+import torch
+from lerobot.common.train_utils import (
+    get_step_checkpoint_dir,
+    load_training_state,
+    save_checkpoint,
+    update_last_checkpoint,
+)
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.optim.factory import make_optimizer_and_scheduler
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.processor import PolicyProcessorPipeline
+from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+from lerobot.utils.random_utils import set_seed
+
+from lerobot_swr.policies.modeling_swr import BCPolicy
+from lerobot_swr.training.configuration_training import SeedsTrainConfig
+from lerobot_swr.training.stacked_policies import StackedPolicies
+
+OPTIONS_FILE = "seeds_train_config.json"
+
+logger = logging.getLogger(__name__)
+
+
+def check_options(config: SeedsTrainConfig) -> None:
+    """Remember the options in the output folder; refuse to go on there with others.
+
+    Raises:
+        ValueError: Naming the options in which the interrupted command differs from this one.
+    """
+    assert config.output_dir is not None
+    file, options = config.output_dir / OPTIONS_FILE, json.loads(json.dumps(config.decisive_options()))
+    if file.is_file():
+        known = json.loads(file.read_text())
+        changed = sorted(key for key in options if options[key] != known.get(key))
+        if changed:
+            raise ValueError(
+                f"output_dir={str(config.output_dir)!r} was begun with other values of {', '.join(changed)} "
+                f"(see {OPTIONS_FILE}); resume with those, or choose another folder"
+            )
+        return
+    config.output_dir.mkdir(parents=True, exist_ok=True)
+    temporary = file.with_name(f".{file.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(options, indent=2))
+    os.replace(temporary, file)
+
+
+def last_step(run: TrainPipelineConfig) -> int:
+    """Step of a run's last complete checkpoint, 0 if there is none."""
+    assert run.output_dir is not None
+    folder = run.output_dir / CHECKPOINTS_DIR
+    steps = [int(path.name) for path in folder.iterdir() if path.name.isdigit()] if folder.is_dir() else []
+    return max(steps, default=0)
+
+
+class SeedRuns:
+    """The runs of some seeds, at the same step: policies, processors and optimizers, new or resumed.
+
+    Attributes:
+        step: Steps that are done.
+        policies: K policies in training mode.
+        preprocessor: Their inputs of raw frames.
+        stack: The policies as one.
+
+    Args:
+        config: The command's configuration.
+        seeds: K seeds whose last checkpoints are of the same step.
+        meta: The dataset's metadata.
+    """
+
+    def __init__(self, config: SeedsTrainConfig, seeds: list[int], meta: LeRobotDatasetMetadata):
+        self.runs = [config.of_seed(seed) for seed in seeds]
+        self.step = last_step(self.runs[0])
+        self.policies: list[BCPolicy] = []
+        optimizers, scheduler = [], None
+        for run in self.runs:
+            policy = self._make_policy(run, meta)
+            optimizer, schedule = make_optimizer_and_scheduler(run, policy)
+            if self.step:
+                load_training_state(self._checkpoint(run, self.step), optimizer, schedule)
+            self.policies.append(policy.train())
+            optimizers.append(optimizer)
+            scheduler = scheduler or schedule
+        self.preprocessor, self._postprocessor = self._make_processors(self.runs[0], meta)
+        self.stack = StackedPolicies(self.policies, optimizers, scheduler, self.runs[0])
+
+    def _make_policy(self, run: TrainPipelineConfig, meta: LeRobotDatasetMetadata) -> BCPolicy:
+        assert run.policy is not None
+        assert run.seed is not None
+        if self.step:
+            run.policy.pretrained_path = self._checkpoint(run, self.step) / PRETRAINED_MODEL_DIR
+        set_seed(run.seed)  # as lerobot-train does, so that the policy starts from the same weights
+        policy = make_policy(run.policy, ds_meta=meta, rename_map=run.rename_map)
+        assert isinstance(policy, BCPolicy)
+        return policy
+
+    def _make_processors(
+        self, run: TrainPipelineConfig, meta: LeRobotDatasetMetadata
+    ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        policy = self.policies[0]
+        path = run.policy.pretrained_path if run.policy is not None else None
+        if path is None or self.step:
+            statistics = {} if self.step else {"dataset_stats": meta.stats}
+            return make_pre_post_processors(policy.config, path, **statistics)
+        # Fine-tuning: the checkpoint's pipelines with the statistics of this dataset.
+        outputs = {"features": policy.config.output_features, "norm_map": policy.config.normalization_mapping}
+        inputs = {**outputs, "features": {**policy.config.input_features, **policy.config.output_features}}
+        return make_pre_post_processors(
+            policy.config,
+            path,
+            dataset_stats=meta.stats,
+            preprocessor_overrides={
+                "device_processor": {"device": str(policy.config.device)},
+                "normalizer_processor": {**inputs, "stats": meta.stats},
+                "rename_observations_processor": {"rename_map": run.rename_map},
+            },
+            postprocessor_overrides={"unnormalizer_processor": {**outputs, "stats": meta.stats}},
+        )
+
+    @staticmethod
+    def _checkpoint(run: TrainPipelineConfig, step: int) -> Path:
+        assert run.output_dir is not None
+        return get_step_checkpoint_dir(run.output_dir, run.steps, step)
+
+    def save(self) -> None:
+        """Write a checkpoint of every run; one that is under way when the process ends leaves nothing."""
+        self.stack.unstack()
+        for k, (run, policy) in enumerate(zip(self.runs, self.policies, strict=True)):
+            folder = self._checkpoint(run, self.step)
+            unfinished = folder.with_name(f".{folder.name}.unfinished")
+            shutil.rmtree(unfinished, ignore_errors=True)
+            assert run.seed is not None
+            # Training draws nothing from the global generator; a run that goes on from here finds it seeded.
+            torch.manual_seed(run.seed)
+            save_checkpoint(
+                unfinished,
+                self.step,
+                run,
+                policy,
+                self.stack.optimizer,
+                self.stack.scheduler,
+                self.preprocessor,
+                self._postprocessor,
+                num_processes=1,
+                batch_size=run.batch_size,
+                optim_state_dict=self.stack.optimizer_state(k),
+            )
+            os.replace(unfinished, folder)
+            update_last_checkpoint(folder)

@@ -1,0 +1,135 @@
+"""Several policies of one configuration, trained as one: their parameters are stacked along a new axis."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from torch import Tensor, nn
+from torch.func import functional_call, vmap
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from lerobot_swr.policies.modeling_swr import BCPolicy
+from lerobot_swr.training.flat_parameters import FlatParameters
+from lerobot_swr.training.traced_gradients import TracedGradients
+
+
+class _FrameLosses(nn.Module):
+    """A policy's loss as a module's call, in which `functional_call` can replace the parameters."""
+
+    def __init__(self, policy: BCPolicy):
+        super().__init__()
+        self.policy = policy
+
+    def forward(self, drawn: dict[str, Tensor]) -> Tensor:
+        return self.policy.frame_losses(drawn).mean()
+
+
+class StackedPolicies:
+    """K policies as one: `vmap` of the policy's own loss over stacked parameters, and one optimizer.
+
+    Every policy learns from its own batches alone, as it would by itself.
+
+    Args:
+        policies: K policies of one configuration, in training mode.
+        optimizers: Their optimizers, fresh or loaded, which differ in nothing but their state.
+        scheduler: The first one's learning-rate schedule, if any; the same for all.
+        config: The run of one of them.
+    """
+
+    def __init__(
+        self,
+        policies: Sequence[BCPolicy],
+        optimizers: Sequence[Optimizer],
+        scheduler: LRScheduler | None,
+        config: TrainPipelineConfig,
+    ):
+        assert config.optimizer is not None
+        self.policies = policies
+        self._max_norm = config.optimizer.grad_clip_norm
+        self._groups = [FlatParameters(policies, group) for group in _group_names(policies[0], optimizers[0])]
+        self._parameters = {name: value for group in self._groups for name, value in group.stacked.items()}
+        one = _FrameLosses(policies[0])
+
+        def loss(parameters: Mapping[str, Tensor], drawn: Mapping[str, Tensor]) -> Tensor:
+            return functional_call(one, {f"policy.{k}": v for k, v in parameters.items()}, (drawn,))
+
+        self._gradients = TracedGradients(vmap(loss), self._parameters)
+        options = [{k: v for k, v in g.items() if k != "params"} for g in optimizers[0].param_groups]
+        self.optimizer = config.optimizer.build(
+            [{**o, "params": [group.flat]} for o, group in zip(options, self._groups, strict=True)]
+        )
+        for place, group in enumerate(self._groups):
+            states = [[o.state.get(p, {}) for p in o.param_groups[place]["params"]] for o in optimizers]
+            self.optimizer.state[group.flat].update(group.flatten_state(states))
+        self.scheduler: LRScheduler | None = None
+        if config.scheduler is not None and scheduler is not None:
+            self.scheduler = config.scheduler.build(self.optimizer, config.steps)
+            assert self.scheduler is not None
+            self.scheduler.load_state_dict(scheduler.state_dict())
+            for options_, rate in zip(self.optimizer.param_groups, scheduler.get_last_lr(), strict=True):
+                options_["lr"] = rate
+
+    def losses_and_gradients(self, drawn: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Each policy's loss and its gradient.
+
+        Args:
+            drawn: What the policies' `draw` returned, stacked: (K, B, ...).
+
+        Returns:
+            (K,) losses, and parameter name to (K, ...) gradients.
+        """
+        return self._gradients(drawn)
+
+    def step(self, drawn: Mapping[str, Tensor]) -> Tensor:
+        """Train every policy on its own frames.
+
+        Args:
+            drawn: As for `losses_and_gradients`.
+
+        Returns:
+            (K,) losses before the step.
+        """
+        losses, gradients = self.losses_and_gradients(drawn)
+        for group in self._groups:
+            group.set_gradient(gradients)
+        self._clip_gradients()
+        self.optimizer.step()
+        if self.scheduler is not None:
+            self.scheduler.step()
+        return losses
+
+    def _clip_gradients(self) -> None:
+        """Limit the norm of each policy's gradient, as `clip_grad_norm_` does for a single policy."""
+        if self._max_norm <= 0:
+            return
+        norms = torch.stack([group.gradient.norm(dim=1) for group in self._groups]).norm(dim=0)  # (K,)
+        if norms.max() <= self._max_norm:
+            return
+        factors = (self._max_norm / (norms + 1e-6)).clamp(max=1)
+        for group in self._groups:
+            group.gradient.mul_(factors[:, None])
+
+    def unstack(self) -> None:
+        """Copy the parameters back into the policies."""
+        with torch.no_grad():
+            for k, policy in enumerate(self.policies):
+                for name, parameter in policy.named_parameters():
+                    parameter.copy_(self._parameters[name][k])
+
+    def optimizer_state(self, k: int) -> dict[str, Any]:
+        """State of policy k's optimizer, as `Optimizer.state_dict` of a single one."""
+        states: list[dict[str, Tensor]] = []
+        groups = []
+        for group, options in zip(self._groups, self.optimizer.state_dict()["param_groups"], strict=True):
+            own = group.unflatten_state(self.optimizer.state[group.flat], k)
+            groups.append({**options, "params": list(range(len(states), len(states) + len(own)))})
+            states += own
+        return {"state": dict(enumerate(states)), "param_groups": groups}
+
+
+def _group_names(policy: BCPolicy, optimizer: Optimizer) -> list[list[str]]:
+    """Names of the parameters in each group of a policy's optimizer."""
+    names = {id(parameter): name for name, parameter in policy.named_parameters()}
+    return [[names[id(parameter)] for parameter in group["params"]] for group in optimizer.param_groups]

@@ -1,0 +1,346 @@
+"""Corrective labels on arrays: inverse model, matching, partners, limiter, each beside a slow oracle."""
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_swr.corrective.feedback import Feedback
+from lerobot_swr.corrective.inverse_model import InverseModel, fit_inverse_model
+from lerobot_swr.corrective.labels import CorrectiveLabels
+from lerobot_swr.corrective.paths import CANDIDATES, DemonstratedPaths
+from lerobot_swr.corrective.relative_actions import RelativeActions, Units, target_dimensions
+from lerobot_swr.demos.catalog import get_recipe
+from lerobot_swr.envs.maze2d.dynamics import MAX_STEP
+from lerobot_swr.trajectories import Trajectories
+
+STATE, ACTION = "observation.state", "action"
+
+
+def make_trajectories(episodes: list[tuple[np.ndarray, np.ndarray]], **columns: np.ndarray) -> Trajectories:
+    """A dataset of (states (T, d), actions (T, A)) per episode."""
+    states, actions = (np.concatenate(part).astype(np.float32) for part in zip(*episodes, strict=True))
+    lengths = np.array([len(states) for states, _ in episodes])
+    return Trajectories(lengths, {STATE: states, ACTION: actions, **columns}, 10, "test")
+
+
+@pytest.fixture(scope="module")
+def maze() -> Trajectories:
+    """The first 30 demonstrations of only_forward."""
+    demonstrations = get_recipe("medium_maze-only_forward").demonstrations(0)
+    chosen = [next(iter_) for iter_ in [iter(demonstrations)] * 30]
+    return make_trajectories([(d.observations[STATE], d.actions) for d in chosen])
+
+
+def servo(lag: float, n_episodes: int = 8, length: int = 150, dim: int = 3) -> Trajectories:
+    """Absolute targets that joints follow with a first-order lag; joint k has the target in dimension -k."""
+    rng = np.random.default_rng(0)
+    episodes = []
+    for _ in range(n_episodes):
+        steps = rng.standard_normal((length, dim))
+        speed = np.stack([np.convolve(s, np.ones(25) / 25, "same") for s in steps.T], axis=1)
+        targets = speed.cumsum(axis=0) * 0.1
+        states = np.zeros((length, dim))
+        for t in range(1, length):
+            states[t] = states[t - 1] + (targets[t - 1] - states[t - 1]) / lag
+        episodes.append((states[:, ::-1].copy(), targets))
+    return make_trajectories(episodes)
+
+
+# --- Inverse model ---
+
+
+def test_the_gain_of_the_maze_is_found_from_its_demonstrations(maze):
+    """An action of 1 moves 0.02 of the side: leading back in h steps takes -1 / (0.02 h), within 10 %."""
+    model = fit_inverse_model(maze)
+    known = -np.eye(2) / (MAX_STEP * model.horizon)
+    assert np.abs(model.gain - known).max() < 0.1 * abs(known[0, 0])
+    assert model.corrected.all()
+    assert (model.targets == -1).all()
+    for horizon in (1, 2):
+        found = fit_inverse_model(maze, horizon).gain
+        assert np.abs(found + np.eye(2) / (MAX_STEP * horizon)).max() < 0.1 / (MAX_STEP * horizon)
+
+
+@pytest.mark.parametrize("lag", [4, 8])
+def test_targets_and_their_lag_are_found(lag):
+    """Actions are targets of joints in another order; h is the lag, where the demonstrated target holds."""
+    model = fit_inverse_model(servo(lag))
+    assert model.targets.tolist() == [2, 1, 0]
+    assert abs(model.horizon - lag) <= 1
+    assert np.abs(model.gain).max() < 0.25  # repeating the target is nearly all of the correction
+    assert model.corrected.all()
+
+
+def test_whether_actions_are_targets_can_be_overridden(maze):
+    """The user's word holds against the data's."""
+    assert (target_dimensions(maze.columns[STATE], maze.columns[ACTION], absolute=True) >= 0).all()
+    trajectories = servo(4)
+    assert (fit_inverse_model(trajectories, absolute=False).targets == -1).all()
+
+
+def test_a_dimension_that_states_do_not_explain_is_not_corrected(maze):
+    """A third action dimension of noise: R² near 0 and a gain of 0; the others are as they were."""
+    noise = np.random.default_rng(0).standard_normal((len(maze.columns[ACTION]), 1)).astype(np.float32)
+    columns = {**maze.columns, ACTION: np.concatenate([maze.columns[ACTION], noise], axis=1)}
+    model = fit_inverse_model(Trajectories(maze.lengths, columns, 10, "test"))
+    assert model.corrected.tolist() == [True, True, False]
+    assert model.r2[2] < 0.1
+    assert (model.gain[2] == 0).all()
+    np.testing.assert_allclose(model.gain[:2], fit_inverse_model(maze).gain)
+
+
+def test_r2_is_that_of_episodes_that_were_not_fitted():
+    """With as many regressors as frames the fit is perfect, the held-out R² is not: nothing is corrected."""
+    rng = np.random.default_rng(0)
+    episodes = [(rng.standard_normal((6, 10)), rng.standard_normal((6, 2))) for _ in range(4)]
+    with pytest.raises(ValueError, match=r"no dimension of the action follows.*R² at most"):
+        fit_inverse_model(make_trajectories(episodes), absolute=False)
+
+
+def test_what_cannot_work_is_refused(maze):
+    """One episode; a horizon beyond the episodes."""
+    with pytest.raises(ValueError, match=r"single episode.*at least 2"):
+        fit_inverse_model(maze.subset([0]))
+    with pytest.raises(ValueError, match=r"corrective_horizon=500: expected 1 to"):
+        fit_inverse_model(maze, horizon=500)
+
+
+def test_a_large_dataset_is_fitted_on_evenly_chosen_episodes(maze, monkeypatch):
+    """The cost of the fit stays bounded; the gain stays what it is."""
+    monkeypatch.setattr("lerobot_swr.corrective.inverse_model.MAX_FRAMES", 800)
+    np.testing.assert_allclose(np.diag(fit_inverse_model(maze, 1).gain), -1 / MAX_STEP, rtol=0.1)
+
+
+# --- Relative actions ---
+
+
+def test_relative_actions_are_standardised_and_translate_back():
+    """In normalised units, whichever they are: mean 0, deviation 1, and exact both ways."""
+    rng = np.random.default_rng(0)
+    states = rng.normal(5, 2, (500, 3)).astype(np.float32)
+    actions = np.stack([states[:, 1] + rng.normal(0.3, 0.01, 500), rng.normal(size=500)], axis=1)
+    actions = actions.astype(np.float32)
+    state = Units(torch.tensor([0.5, 2.0, 1.0]), torch.tensor([-2.0, 1.0, 0.0]))
+    action = Units(torch.tensor([4.0, 3.0]), torch.tensor([-7.0, 0.5]))
+    relative = RelativeActions(2, 3)
+    relative.fit(states, actions, np.array([1, -1]), state, action)
+    normalized_states = state.normalize(torch.from_numpy(states))
+    normalized = action.normalize(torch.from_numpy(actions))
+    encoded = relative.encode(normalized, normalized_states)
+    assert abs(float(encoded[:, 0].mean())) < 1e-2
+    assert float(encoded[:, 0].std()) == pytest.approx(1, rel=1e-2)
+    torch.testing.assert_close(encoded[:, 1], normalized[:, 1])
+    torch.testing.assert_close(relative.decode(encoded, normalized_states), normalized, atol=1e-4, rtol=1e-5)
+
+
+# --- Paths ---
+
+
+def test_the_nearest_frame_in_the_window_is_found(maze):
+    """Beside a loop over the window in NumPy, with every dimension in units of its range."""
+    paths = DemonstratedPaths(maze.columns[STATE], maze.lengths)
+    rng = np.random.default_rng(0)
+    rows = rng.integers(0, len(maze.columns[STATE]), 60)
+    states = maze.columns[STATE][rows] + rng.normal(0, 0.1, (60, 2)).astype(np.float32)
+    scale = np.ptp(maze.columns[STATE], axis=0)
+    for state, row, found in zip(
+        states, rows, paths.nearest(torch.from_numpy(states), torch.from_numpy(rows)).tolist(), strict=True
+    ):
+        episode = int(np.searchsorted(maze.starts, row, side="right") - 1)
+        first = max(maze.starts[episode], row - paths.window)
+        last = min(maze.starts[episode] + maze.lengths[episode] - 1, row + paths.window)
+        distances = np.linalg.norm((maze.columns[STATE][first : last + 1] - state) / scale, axis=1)
+        assert found == first + distances.argmin()
+
+
+def test_constant_dimensions_do_not_count(maze):
+    """A dimension that never changes alters neither distances nor, by its zero range, anything else."""
+    constant = np.full((len(maze.columns[STATE]), 1), 3.0, np.float32)
+    wider = np.concatenate([maze.columns[STATE], constant], axis=1)
+    rows = torch.arange(0, 2000, 50)
+    plain, wide = (DemonstratedPaths(s, maze.lengths) for s in (maze.columns[STATE], wider))
+    shifted = plain.states[rows] + 0.05
+    found = wide.nearest(torch.cat([shifted, torch.zeros(len(rows), 1)], dim=1), rows)
+    assert torch.equal(found, plain.nearest(shifted, rows))
+
+
+def slow_cost(paths: DemonstratedPaths, trajectories: Trajectories, row: int, episode: int) -> float:
+    """Mean distance of a frame's next frames to a whole demonstration, in loops."""
+    scale = np.ptp(trajectories.columns[STATE], axis=0)
+    own = int(np.searchsorted(trajectories.starts, row, side="right") - 1)
+    last = trajectories.starts[own] + trajectories.lengths[own] - 1
+    other = trajectories.episode(episode)[STATE]
+    nearest = []
+    for offset in paths._future.tolist():
+        state = trajectories.columns[STATE][min(row + offset, last)]
+        nearest.append(np.sqrt(np.square((other - state) / scale).mean(axis=1)).min())
+    return float(np.mean(nearest))
+
+
+def test_partners_are_drawn_by_their_cost(maze):
+    """Frequencies beside a simulation in NumPy that draws candidates and weighs them by exp(-c / h)."""
+    short = [(maze.episode(i)[STATE][:4], maze.episode(i)[ACTION][:4]) for i in (0, 1, 2)]
+    short = [(states + 0.3 * i, actions) for i, (states, actions) in enumerate(short)]
+    small = make_trajectories(short)
+    paths = DemonstratedPaths(small.columns[STATE], small.lengths)
+    draws, bandwidth = 20_000, 0.2
+    uniforms = torch.rand(draws, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0))
+    rows, matched = paths.draw_partners(
+        torch.zeros(draws, dtype=torch.int64), torch.arange(3), bandwidth, uniforms.double()
+    )
+    others = np.arange(4, 12)
+    costs = np.array([slow_cost(paths, small, row, 0) for row in others])
+    rng = np.random.default_rng(1)
+    candidates = rng.integers(len(others), size=(draws, CANDIDATES))
+    weights = np.exp(-costs[candidates] / bandwidth)
+    place = (weights.cumsum(axis=1) < rng.random((draws, 1)) * weights.sum(axis=1, keepdims=True)).sum(axis=1)
+    expected = np.bincount(others[candidates[np.arange(draws), place]], minlength=12) / draws
+    found = np.bincount(rows, minlength=12) / draws
+    assert found[:4].sum() == 0
+    np.testing.assert_allclose(found, expected, atol=5 * np.sqrt(0.25 * 2 / draws))
+    assert ((matched >= 0) & (matched < 4)).all()
+
+
+def test_only_candidates_become_partners(maze):
+    """Episodes outside of training lend no frame."""
+    paths = DemonstratedPaths(maze.columns[STATE], maze.lengths)
+    candidates = torch.tensor([1, 4, 9, 20])
+    own = candidates[torch.arange(400) % 4]
+    uniforms = torch.rand(400, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0)).double()
+    rows, matched = paths.draw_partners(own, candidates, 0.1, uniforms)
+    assert set(paths.episode[rows].tolist()) == set(candidates.tolist())
+    assert (paths.episode[rows] != own).all()
+    assert torch.equal(paths.episode[matched], own)
+
+
+def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
+    """Demonstrations go out and come back the same way: frames on the way back are matched there."""
+    way = np.concatenate([np.linspace(0, 1, 50), np.linspace(1, 0, 50)])[:, None]
+    rng = np.random.default_rng(0)
+    episodes = [(way + 0.001 * rng.standard_normal(way.shape), np.gradient(way[:, 0])[:, None])] * 6
+    trajectories = make_trajectories(episodes)
+    paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
+    uniforms = torch.rand(500, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0)).double()
+    rows, matched = paths.draw_partners(torch.zeros(500, dtype=torch.int64), torch.arange(6), 0.1, uniforms)
+    away_from_the_turn = (paths.phase(rows) - 0.5).abs() > 0.3
+    assert away_from_the_turn.sum() > 100
+    same_way = (paths.phase(rows) > 0.5) == (paths.phase(matched) > 0.5)
+    assert same_way[away_from_the_turn].all()
+
+
+# --- Feedback and labels ---
+
+
+def test_the_limiter_scales_and_never_turns_an_action(maze):
+    """Actions keep their direction, end within ± the largest demonstrated magnitude, and small ones stay."""
+    feedback = Feedback(maze, fit_inverse_model(maze))
+    limits = np.abs(maze.columns[ACTION]).max(axis=0)
+    actions = torch.randn(300, 2, generator=torch.Generator().manual_seed(0)) * 2
+    limited = feedback.limit(actions)
+    assert (limited.abs().numpy() <= limits * (1 + 1e-6)).all()
+    torch.testing.assert_close(torch.nn.functional.normalize(limited), torch.nn.functional.normalize(actions))
+    small = (actions.abs().numpy() <= limits).all(axis=1)
+    assert torch.equal(limited[small], actions[small])
+    assert (limited[~small].abs().numpy() >= limits * (1 - 1e-6)).any(axis=1).all()
+    assert (limited < 0).any()  # backwards, although no demonstration moves backwards
+    assert feedback.limit(torch.zeros(1, 2)).tolist() == [[0, 0]]
+
+
+def test_a_target_is_limited_relative_to_the_state():
+    """Far from the path an absolute target leads towards it by at most the largest demonstrated lead."""
+    trajectories = servo(4)
+    feedback = Feedback(trajectories, fit_inverse_model(trajectories))
+    lead = np.abs(trajectories.columns[ACTION] - trajectories.columns[STATE][:, ::-1]).max(axis=0)
+    rows = torch.tensor([40, 200, 700])
+    states = feedback.paths.states[rows] + torch.tensor([5.0, 0, 0])
+    moved = feedback.act(states, rows) - states.flip(1)
+    assert (moved.abs().numpy() <= lead * (1 + 1e-4)).all()
+    assert (moved[:, 2] < 0).all()  # joint 0 is the target of dimension 2
+
+
+def test_labels_beside_the_path_lead_back_to_it(maze):
+    """In the known dynamics, following the labels shrinks the distance to the path threefold in 8 steps."""
+    feedback = Feedback(maze, fit_inverse_model(maze))
+    rows = torch.from_numpy(maze.starts + 20)
+    offsets = torch.randn(len(rows), 2, generator=torch.Generator().manual_seed(0)) * 0.05
+    states, matched = feedback.paths.states[rows] + offsets, rows
+    before = (states - feedback.paths.states[feedback.paths.nearest(states, matched)]).norm(dim=1)
+    for _ in range(8):
+        matched = feedback.paths.nearest(states, matched)
+        states = states + MAX_STEP * feedback.act(states, matched).clamp(-1, 1)
+    after = (states - feedback.paths.states[feedback.paths.nearest(states, matched)]).norm(dim=1)
+    assert after.mean() < before.mean() / 3
+    assert (feedback.paths.phase(matched) > feedback.paths.phase(rows)).float().mean() > 0.9
+
+
+@pytest.mark.parametrize("kind", ["noise", "demos"])
+def test_labels_are_the_formula_at_the_matched_frame(maze, kind):
+    """a' = limit(a_u + J (x - s_u)), recomputed in NumPy; what actions do not move comes from frame u."""
+    n = len(maze.columns[STATE])
+    clock = np.arange(n, dtype=np.float32)[:, None]
+    trajectories = Trajectories(
+        maze.lengths, {**maze.columns, "observation.environment_state": clock}, 10, "t"
+    )
+    model = fit_inverse_model(trajectories)
+    keys = [STATE, "observation.environment_state"]
+    labels = CorrectiveLabels(trajectories, model, kind, 0.1, keys)
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(n, (400,), generator=generator)
+    uniforms = torch.rand(400, labels.draws_per_frame, generator=generator, dtype=torch.float64)
+    found = labels.relabel(rows, uniforms, torch.arange(len(trajectories)))
+    assert found.places.tolist() == np.flatnonzero(uniforms[:, 0] < 0.5).tolist()
+
+    u = found.observations["observation.environment_state"][:, 0].long().numpy()
+    states = found.observations[STATE].numpy()
+    episode = np.searchsorted(maze.starts, rows[found.places].numpy(), side="right") - 1
+    assert (np.searchsorted(maze.starts, u, side="right") - 1 == episode).all()
+    expected = maze.columns[ACTION][u] + (states - maze.columns[STATE][u]) @ model.gain.T
+    limits = np.abs(maze.columns[ACTION]).max(axis=0)
+    expected /= np.maximum(np.abs(expected / limits).max(axis=1), 1)[:, None]
+    np.testing.assert_allclose(found.actions, expected, atol=2e-5)
+    if kind == "demos":
+        demonstrated = {tuple(s) for s in maze.columns[STATE]}
+        assert all(tuple(s) in demonstrated for s in states)
+
+
+def test_noise_is_log_uniform_up_to_the_scale(maze):
+    """Standard deviations between a tenth of the scale and the scale, in units of each dimension's range."""
+    labels = CorrectiveLabels(maze, fit_inverse_model(maze), "noise", 0.2, [STATE])
+    n = 40_000
+    rows = torch.full((n,), 500)
+    uniforms = torch.rand(n, labels.draws_per_frame, generator=torch.Generator().manual_seed(0)).double()
+    found = labels.relabel(rows, uniforms, torch.arange(30)).observations[STATE].numpy()
+    offsets = (found - maze.columns[STATE][500]) / np.ptp(maze.columns[STATE], axis=0)
+    # E[σ²] of a log-uniform σ in [0.02, 0.2] is (0.2² - 0.02²) / (2 ln 10)
+    assert np.square(offsets).mean(axis=0) == pytest.approx((0.2**2 - 0.02**2) / (2 * np.log(10)), rel=0.05)
+    assert np.abs(offsets.mean(axis=0)).max() < 0.003
+
+
+@pytest.mark.parametrize("kind", ["noise", "demos"])
+def test_labels_of_many_frames_at_once_are_those_of_a_few(maze, kind, monkeypatch):
+    """Batches may be split and joined at will, and memory is bounded by chunks."""
+    labels = CorrectiveLabels(maze, fit_inverse_model(maze), kind, 0.1, [STATE])
+    generator = torch.Generator().manual_seed(0)
+    rows = torch.randint(len(maze.columns[STATE]), (90,), generator=generator)
+    uniforms = torch.rand(90, labels.draws_per_frame, generator=generator, dtype=torch.float64)
+    candidates = torch.arange(30)
+    whole = labels.relabel(rows, uniforms, candidates)
+    monkeypatch.setattr("lerobot_swr.corrective.labels.CHUNK", 7)
+    parts = [labels.relabel(rows[i : i + 30], uniforms[i : i + 30], candidates) for i in (0, 30, 60)]
+    torch.testing.assert_close(whole.actions, torch.cat([part.actions for part in parts]))
+    torch.testing.assert_close(whole.observations[STATE], torch.cat([p.observations[STATE] for p in parts]))
+
+
+def test_without_partners_frames_stay_as_they_are(maze):
+    """A single candidate: demos replaces nothing."""
+    labels = CorrectiveLabels(maze, fit_inverse_model(maze), "demos", 0.1, [STATE])
+    found = labels.relabel(torch.arange(10), torch.zeros(10, labels.draws_per_frame), torch.tensor([0]))
+    assert len(found.places) == len(found.actions) == 0
+
+
+def test_a_gain_of_zero_repeats_the_demonstrated_action(maze):
+    """Without a gain the label is the matched frame's action."""
+    model = InverseModel(3, np.zeros((2, 2)), np.zeros(2), np.full(2, -1))
+    feedback = Feedback(maze, model)
+    rows = torch.tensor([5, 100])
+    torch.testing.assert_close(feedback.act(feedback.paths.states[rows] + 0.1, rows), feedback.actions[rows])

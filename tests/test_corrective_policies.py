@@ -1,0 +1,337 @@
+"""Corrective labels in the policies zbc and wzbc: what they learn from, checkpoints, LeRobot's commands."""
+
+import copy
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import save_checkpoint, train_flags
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import make_policy, make_pre_post_processors
+from lerobot.policies.factory import get_policy_class, make_policy_config
+from safetensors.torch import load_file
+
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
+from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.offline import frame_errors
+from lerobot_swr.policies.style_extension import add_demonstrations
+
+STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
+SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2")
+LAG = 4
+
+
+def servo_demonstrations(seed: int):
+    """Two joints that follow absolute targets."""
+    rng = np.random.default_rng(seed)
+    for _ in range(6):
+        noise = rng.standard_normal((90, 2))
+        targets = np.stack([np.convolve(n, np.ones(15) / 15, "same") for n in noise.T], axis=1).cumsum(axis=0)
+        states = np.zeros((90, 2))
+        for t in range(1, 90):
+            states[t] = states[t - 1] + (targets[t - 1] - states[t - 1]) / LAG
+        yield Demonstration({STATE: states.astype(np.float32)}, targets.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def servo_dataset(tmp_path_factory) -> Path:
+    """Folder of a dataset whose actions are absolute targets."""
+    root = tmp_path_factory.mktemp("datasets") / "servo"
+    features = {STATE: ("a", "b"), ACTION: ("a", "b")}
+    recipe = DatasetRecipe(
+        "servo", "Move.", 20, "arm", features, 6, servo_demonstrations, lambda episode: "moved"
+    )
+    write_dataset(recipe, root)
+    return root
+
+
+def make(root: Path, policy_type: str = "zbc", **options):
+    """A small policy on a dataset, in training mode."""
+    torch.manual_seed(0)
+    options = {"hidden_dim": 16, "num_hidden": 3, "device": "cpu", "push_to_hub": False, **options}
+    meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    return make_policy(make_policy_config(policy_type, **options), ds_meta=meta).train(), meta
+
+
+def batch_of(policy, meta, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+    """Frames as LeRobot's loader and preprocessor bring them."""
+    trajectories = policy.trajectories
+    raw = {key: torch.from_numpy(column)[rows] for key, column in trajectories.columns.items()}
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
+    prepared = preprocessor({key: raw[key] for key in [*policy.config.observation_keys, ACTION]})
+    episodes = np.repeat(np.arange(len(trajectories)), trajectories.lengths)
+    keys = [*policy.config.observation_keys, ACTION]
+    return {
+        **{k: prepared[k] for k in keys},
+        "episode_index": torch.from_numpy(episodes)[rows],
+        "index": rows,
+    }
+
+
+def every_frame(policy) -> torch.Tensor:
+    """All rows of the dataset, shuffled."""
+    count = int(policy.trajectories.lengths.sum())
+    return torch.randperm(count, generator=torch.Generator().manual_seed(3))
+
+
+@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
+def test_without_corrective_labels_nothing_is_added(small_maze, policy_type):
+    """The default is the paper's: no tensor, no draw and no figure more, the actions the network's."""
+    policy, meta = make(small_maze, policy_type)
+    assert policy.config.corrective == "none"
+    assert policy.corrections is None
+    assert not [key for key in policy.state_dict() if "corrections" in key]
+    batch = batch_of(policy, meta, every_frame(policy))
+    drawn = policy.draw(batch)
+    assert "corrective" not in drawn
+    assert all(torch.equal(drawn[key], batch[key]) for key in (STATE, ENV, ACTION))
+    style = policy.styles.embedding(batch["episode_index"])
+    assert torch.equal(policy.predict(batch, style), policy.network(batch, style))
+
+
+@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
+@pytest.mark.parametrize("kind", ["noise", "demos"])
+def test_half_of_the_frames_are_corrective_and_under_their_own_style(small_maze, policy_type, kind):
+    """They have their episode's style and weight; the others stay what they are without corrective labels."""
+    policy, meta = make(small_maze, policy_type, corrective=kind)
+    plain, _ = make(small_maze, policy_type)
+    batch = batch_of(policy, meta, every_frame(policy))
+    drawn, expected = policy.draw(batch), plain.draw(batch)
+    corrective = drawn["corrective"]
+    assert abs(corrective.float().mean() - 0.5) < 0.1
+    for key, value in expected.items():
+        assert torch.equal(drawn[key][~corrective], value[~corrective]), key
+    assert torch.equal(drawn["style_episode"][corrective], batch["episode_index"][corrective])
+    torch.testing.assert_close(
+        drawn["weight"][corrective], policy.frame_weights(batch["episode_index"])[corrective]
+    )
+    if policy_type == "wzbc":
+        assert not drawn["relabelled"][corrective].any()
+        assert drawn["relabelled"].any()
+    assert ((drawn[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
+
+
+@pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "IDENTITY"])
+def test_corrective_frames_are_normalised_as_lerobot_normalises(small_maze, mode):
+    """Raw labels through LeRobot's own preprocessor are what the policy draws, under every normalisation."""
+    mapping = dict.fromkeys(("STATE", "ENV", "ACTION"), mode)
+    policy, meta = make(small_maze, corrective="noise", normalization_mapping=mapping)
+    batch = batch_of(policy, meta, every_frame(policy))
+    corrections = copy.deepcopy(policy.corrections)
+    drawn = policy.draw(batch)
+    n, per_frame = len(batch["index"]), corrections.labels.draws_per_frame
+    uniforms = torch.from_numpy(corrections.draws.uniforms(1, n * per_frame)).view(n, per_frame)
+    raw = corrections.labels.relabel(batch["index"], uniforms, torch.arange(6))
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
+    expected = preprocessor({**raw.observations, ACTION: raw.actions})
+    for key in (STATE, ENV, ACTION):
+        torch.testing.assert_close(drawn[key][raw.places], expected[key], atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
+def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type):
+    """From the first step on, when partners are still few, and later."""
+    one, meta = make(small_maze, policy_type, corrective="demos")
+    many = copy.deepcopy(one)
+    rows = every_frame(one)[:160].view(10, 16)
+    for part in (rows[:6], rows[6:]):
+        singly = [one.draw(batch_of(one, meta, step)) for step in part]
+        at_once = many.draw(batch_of(many, meta, part.flatten()), len(part))
+        for key in ("style_episode", "weight", STATE, ACTION):
+            together = torch.cat([drawn[key] for drawn in singly])
+            torch.testing.assert_close(at_once[key], together, atol=1e-5, rtol=1e-5)
+
+
+def test_pairs_and_corrective_draws_are_independent(small_maze):
+    """The streams of random numbers differ, and each step's differ from the last one's."""
+    policy, _ = make(small_maze, "wzbc", corrective="noise")
+    pairs, labels = policy.draws.uniforms(2, 500), policy.corrections.draws.uniforms(2, 500)
+    assert abs(np.corrcoef(pairs, labels)[0, 1]) < 0.15
+    assert abs(np.corrcoef(labels[:500], labels[500:])[0, 1]) < 0.2
+
+
+def test_figures_count_each_kind_of_frame_for_itself(small_maze):
+    """corrective_loss, own_style_loss and relabelled_loss recomputed from the drawn frames' errors."""
+    policy, meta = make(small_maze, "wzbc", corrective="demos", p=0.4)
+    drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
+    losses = policy.frame_losses(drawn).detach()
+    figures = policy.figures(drawn, losses)
+    corrective, relabelled = drawn["corrective"], drawn["relabelled"]
+    assert figures["corrective_loss"] == pytest.approx(float((losses * corrective).mean() / 0.5), rel=1e-5)
+    own = ~corrective & ~relabelled
+    assert figures["own_style_loss"] == pytest.approx(float((losses * own).mean() / 0.6 / 0.5), rel=1e-5)
+    others = float((losses * relabelled).mean() / 0.4 / 0.5)
+    assert figures["relabelled_loss"] == pytest.approx(others, rel=1e-5)
+
+
+# --- Targets ---
+
+
+def test_absolute_targets_are_learned_relative_to_the_state(servo_dataset):
+    """The network's outputs are standardised leads; predictions are the dataset's actions again."""
+    policy, meta = make(servo_dataset, corrective="noise")
+    assert policy.config.action_targets == [0, 1]
+    assert abs(policy.config.inverse_horizon - LAG) <= 1
+    batch = batch_of(policy, meta, every_frame(policy))
+    drawn = policy.draw(batch)
+    own = ~drawn["corrective"]
+    leads = policy.trajectories.columns[ACTION] - policy.trajectories.columns[STATE]
+    expected = ((leads - leads.mean(axis=0)) / leads.std(axis=0))[batch["index"][own]]
+    np.testing.assert_allclose(drawn[ACTION][own], expected, atol=2e-4)
+    decoded = policy.corrections.decode(drawn[ACTION], drawn)
+    torch.testing.assert_close(decoded[own], batch[ACTION][own], atol=1e-4, rtol=1e-4)
+    policy.eval()
+    policy.styles.trained.fill_(1)
+    assert torch.allclose(policy.draw(batch)[ACTION][own], drawn[ACTION][own])
+
+
+def test_relative_checkpoints_act_the_same_without_their_dataset(servo_dataset, tmp_path):
+    """What translates the outputs is in the checkpoint; nothing of the dataset is."""
+    policy, meta = make(servo_dataset, corrective="demos")
+    policy.draw(batch_of(policy, meta, every_frame(policy)))
+    folder = save_checkpoint(policy, meta, tmp_path)
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    checkpoint = load_checkpoint(config)
+    batch = batch_of(policy, meta, torch.arange(50))
+    style = policy.styles.embedding(batch["episode_index"])
+    assert torch.equal(checkpoint.policy.predict(batch, style), policy.predict(batch, style))
+    stored = load_file(folder / "model.safetensors")
+    assert {k for k in stored if k.startswith("corrections.")} == {
+        "corrections.draws.seed",
+        "corrections.draws.step",
+        *(f"corrections.relative.{name}" for name in ("offset", "scale", "state_gain")),
+    }
+    saved = json.loads((folder / "config.json").read_text())
+    assert saved["inverse_r2"] == policy.config.inverse_r2
+    assert len(saved["inverse_r2"]) == 2
+
+    # The evaluation on frames compares actions, not the network's outputs.
+    trajectories = load_reference(DatasetSource(root=servo_dataset), checkpoint)
+    errors = frame_errors(checkpoint, trajectories).squared["own"]
+    whole = batch_of(policy, meta, torch.arange(len(errors)))
+    own = policy.predict(whole, policy.styles.embedding(whole["episode_index"]))
+    np.testing.assert_allclose(errors, (own - whole[ACTION]).square().detach(), atol=1e-5)
+
+
+def test_styles_are_encoded_by_the_error_of_actions(servo_dataset):
+    """Held-out and added demonstrations: the reported error is that of the policy's actions."""
+    policy, meta = make(servo_dataset, corrective="noise")
+    policy.styles.trained[:4] = 1
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
+    added = add_demonstrations(policy, preprocessor, policy.trajectories, policy.trajectories, [5])
+    start, length = policy.trajectories.starts[5], policy.trajectories.lengths[5]
+    frames = batch_of(policy, meta, torch.arange(start, start + length))
+    error = (
+        policy.predict(frames, policy.styles.embedding(frames["episode_index"])) - frames[ACTION]
+    ).square()
+    assert added.errors[0] == pytest.approx(float(error.mean().detach()), rel=1e-4)
+
+
+def test_relative_actions_can_be_switched_off_and_horizons_set(servo_dataset):
+    """--policy.corrective_relative=false, --policy.corrective_horizon."""
+    policy, _ = make(servo_dataset, corrective="noise", corrective_relative=False, corrective_horizon=2)
+    assert policy.config.action_targets is None
+    assert policy.config.inverse_horizon == 2
+    assert policy.corrections.relative is None
+
+
+# --- Refusals ---
+
+
+def test_actions_that_states_do_not_explain_are_refused(tmp_path):
+    """The error names the R² that was reached and the way out."""
+    rng = np.random.default_rng(0)
+
+    def demonstrations(seed: int):
+        for _ in range(4):
+            states = rng.standard_normal((40, 2)).astype(np.float32)
+            yield Demonstration({STATE: states}, rng.standard_normal((40, 2)).astype(np.float32))
+
+    features = {STATE: ("a", "b"), ACTION: ("a", "b")}
+    recipe = DatasetRecipe("random", "Move.", 20, "arm", features, 4, demonstrations, lambda episode: "moved")
+    write_dataset(recipe, tmp_path / "random")
+    with pytest.raises(ValueError, match=r"held-out R² at most -?0\.\d\d, needed 0.8.*corrective=none"):
+        make(tmp_path / "random", corrective="noise")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"corrective": "both"}, "corrective='both'"), ({"corrective_scale": 0}, "corrective_scale=0")],
+)
+def test_bad_values_are_named(small_maze, options, message):
+    """Unknown kinds and scales that are none."""
+    with pytest.raises(ValueError, match=message):
+        make(small_maze, **options)
+
+
+def test_a_dataset_of_images_alone_is_refused():
+    """Corrective labels need states; the error says which feature is missing."""
+    from lerobot.configs import FeatureType, PolicyFeature
+
+    config = make_policy_config("zbc", corrective="demos", device="cpu", num_episodes=3)
+    config.input_features = {"observation.image": PolicyFeature(type=FeatureType.VISUAL, shape=(3, 8, 8))}
+    config.output_features = {ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
+    with pytest.raises(ValueError, match=r"needs the feature 'observation.state'"):
+        get_policy_class("zbc")(config)
+
+
+# --- LeRobot's commands ---
+
+
+def tensors(output_dir: Path, step: int) -> dict[str, torch.Tensor]:
+    return load_file(output_dir / "checkpoints" / f"{step:06d}" / "pretrained_model" / "model.safetensors")
+
+
+@pytest.mark.parametrize(("policy_type", "kind"), [("zbc", "noise"), ("wzbc", "demos")])
+def test_a_killed_run_resumes_to_the_same_weights(
+    lerobot_train_command, servo_dataset, tmp_path, policy_type, kind
+):
+    """Uninterrupted: 20 steps. Killed after step 10 and resumed: the same weights, bit for bit."""
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    flags = [*SMALL, f"--policy.corrective={kind}", "--save_freq=10", "--log_freq=5"]
+    lerobot_train_command(*train_flags(policy_type, servo_dataset, whole, 20, *flags))
+    shutil.copytree(whole, killed, symlinks=True)
+    shutil.rmtree(killed / "checkpoints" / "000020")
+    config = killed / "checkpoints" / "000010" / "pretrained_model" / "train_config.json"
+    config.write_text(config.read_text().replace(str(whole), str(killed)))
+    lerobot_train_command(f"--config_path={config}", "--resume=true")
+    expected, resumed = tensors(whole, 20), tensors(killed, 20)
+    assert expected.keys() == resumed.keys()
+    for name, value in expected.items():
+        assert torch.equal(value, resumed[name]), name
+
+
+def test_held_out_episodes_lend_no_states(small_maze):
+    """Only episodes that were trained on become partners, and their states are the only ones that appear."""
+    policy, meta = make(small_maze, corrective="demos")
+    episodes = np.repeat(np.arange(6), policy.trajectories.lengths)
+    rows = torch.from_numpy(np.flatnonzero(np.isin(episodes, (0, 2, 3))))
+    policy.draw(batch_of(policy, meta, rows))
+    batch = batch_of(policy, meta, rows[torch.randint(len(rows), (800,))])
+    drawn = policy.draw(batch)
+    everything = batch_of(policy, meta, torch.arange(len(episodes)))[STATE]
+    distances = torch.cdist(drawn[STATE][drawn["corrective"]].double(), everything.double())
+    owners = episodes[distances.argmin(dim=1)]
+    assert distances.amin(dim=1).max() < 1e-4
+    assert set(owners.tolist()) == {0, 2, 3}
+
+
+def test_a_plain_checkpoint_is_fine_tuned_with_corrective_labels(lerobot_train_command, small_maze, tmp_path):
+    """--policy.path with --policy.corrective=noise: the network and the styles are kept."""
+    plain, tuned = tmp_path / "plain", tmp_path / "tuned"
+    lerobot_train_command(*train_flags("zbc", small_maze, plain, 10, *SMALL))
+    flags = [flag for flag in train_flags("zbc", small_maze, tuned, 1) if "policy.type" not in flag]
+    checkpoint = plain / "checkpoints" / "000010" / "pretrained_model"
+    lerobot_train_command(
+        *flags, f"--policy.path={checkpoint}", "--policy.corrective=noise", "--policy.optimizer_lr=1e-9"
+    )
+    before, after = tensors(plain, 10), tensors(tuned, 1)
+    assert "corrections.draws.seed" in after
+    for name, value in before.items():
+        torch.testing.assert_close(after[name], value, atol=1e-6, rtol=0)

@@ -1,0 +1,135 @@
+"""Playback with feedback, and the evaluation of robustness."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from lerobot_swr.cli import eval as eval_command
+from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
+from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
+from lerobot_swr.evaluation.behavior_evaluation import evaluate_behaviors
+from lerobot_swr.evaluation.metrics import median_interval
+from lerobot_swr.evaluation.playback import PlaybackPolicy, playback_checkpoint
+from lerobot_swr.evaluation.robustness import perturbed
+from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.trajectories import load_trajectories
+
+STATE = "observation.state"
+ENV = ("--env.type=maze2d", "--env.task=small", "--env.episode_length=80")
+
+
+@pytest.fixture(scope="module")
+def demonstrations(small_maze_meta):
+    """The small maze's demonstrations."""
+    return load_trajectories(small_maze_meta, [STATE, "action"])
+
+
+def test_playback_repeats_its_demonstration(demonstrations):
+    """From its own start, step by step: the demonstration's states and its length."""
+    env = Maze2DEnvConfig(task="small", episode_length=80)
+    checkpoint = playback_checkpoint(demonstrations, "fixed")
+    rollouts = run_rollouts(checkpoint, env, env.behavior_rule(), 6, 6, seed=0)
+    assert [rollout.style_episode for rollout in rollouts] == list(range(6))
+    for rollout in rollouts:
+        demonstrated = demonstrations.episode(rollout.style_episode)
+        assert rollout.success
+        assert rollout.behavior == env.behavior_rule()(demonstrated)
+        assert abs(rollout.length - env.steps_to_end(demonstrated)) <= 1
+        path = demonstrated[STATE][: rollout.length + 1]
+        np.testing.assert_allclose(rollout.observations[STATE][: len(path)], path, atol=0.01)
+
+
+def test_playback_comes_back_where_blind_replay_does_not(demonstrations):
+    """Pushed aside, playback ends within a step of where the undisturbed one does; open loop stays aside."""
+    policy = PlaybackPolicy(demonstrations, "fixed")
+    policy.reset()
+    states = torch.from_numpy(demonstrations.columns[STATE][demonstrations.starts]) + 0.05
+    blind = states.clone()
+    for t in range(30):
+        states = states + 0.02 * policy.select_action({STATE: states})
+        rows = torch.from_numpy(demonstrations.starts + t)
+        blind = blind + 0.02 * torch.from_numpy(demonstrations.columns["action"])[rows]
+
+    def distance(points: torch.Tensor) -> float:
+        ways = [torch.from_numpy(e[STATE]) for e in demonstrations.episodes()]
+        return max(float((w - p).norm(dim=1).min()) for w, p in zip(ways, points, strict=True))
+
+    assert distance(states) < 0.02
+    assert distance(blind) > 0.03
+
+
+def test_the_command_evaluates_every_perturbation(run_command, small_maze, tmp_path):
+    """--robustness with the baseline: one row per perturbation, none first, each style once."""
+    flags = ("--baseline=playback", "--robustness=true", "--n_episodes=6", f"--dataset.root={small_maze}")
+    run_command(eval_command.main, *flags, f"--output_dir={tmp_path}", *ENV)
+    result = json.loads((tmp_path / "robustness.json").read_text())
+    names = [cell["perturbation"] for cell in result["cells"]]
+    assert names == ["as it is", *Maze2DEnvConfig(task="small").perturbations()]
+    assert result["style_sampling"] == "stratified"
+    assert result["provenance"]["policy"] == "playback"
+    for cell in result["cells"]:
+        low, high = cell["success_interval"]["low"], cell["success_interval"]["high"]
+        assert low <= cell["success_rate"] <= high
+        assert cell["env"] == perturbed(Maze2DEnvConfig(task="small"))[cell["perturbation"]]
+    undisturbed = result["cells"][0]
+    assert (undisturbed["success_rate"], undisturbed["style_match"], undisturbed["l1"]) == (1, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--baseline=replay", *ENV), "baseline='replay': expected 'playback'"),
+        (("--baseline=playback", "--policy.path=x", *ENV), "leave out --policy.path"),
+        (("--baseline=playback",), "acts in an environment"),
+        (("--baseline=playback", "--blend=3", *ENV), "no styles to blend"),
+    ],
+)
+def test_what_the_baseline_cannot_do_is_told(run_command, small_maze, tmp_path, capsys, flags, message):
+    """One line that names the flag."""
+    with pytest.raises(SystemExit):
+        run_command(eval_command.main, *flags, f"--dataset.root={small_maze}", f"--output_dir={tmp_path}")
+    assert message in capsys.readouterr().err
+
+
+def test_only_doors_ahead_of_the_start_are_expected():
+    """A start beyond a wall cannot pass its door; D3IL expects all of the behaviour."""
+    env = Maze2DEnvConfig(task="medium")
+    starts = {0.1: "6410", 0.3: "410", 0.6: "10", 0.8: "0"}
+    for y, expected in starts.items():
+        assert env.expected_behavior("6410", {STATE: np.array([[0.5, y]])}) == expected
+    assert D3ILEnvConfig().expected_behavior("top-mid-bottom", {}) == "top-mid-bottom"
+
+
+def test_style_match_and_length_error_follow_the_requested_demonstrations():
+    """Recomputed by hand: the length error is over successes that show what was asked for."""
+
+    def rollout(y, behavior, success, length, episode):
+        return Rollout({STATE: np.array([[0.5, y]])}, behavior, success, length, episode)
+
+    rollouts = [
+        rollout(0.1, "6410", True, 50, 0),  # as asked, 2 steps longer
+        rollout(0.3, "410", True, 40, 0),  # as far as possible, 8 steps shorter
+        rollout(0.1, "7420", True, 48, 0),  # another way
+        rollout(0.1, "64", False, 200, 0),  # a failure
+    ]
+    result = evaluate_behaviors(
+        rollouts,
+        ["6410", "7420"],
+        "fixed",
+        demonstrated_lengths=[48, 60],
+        env_cfg=Maze2DEnvConfig(task="medium"),
+    )
+    assert result.style_fidelity == 0.5
+    assert result.style_fidelity_interval.low < 0.5 < result.style_fidelity_interval.high
+    assert result.length_error == 5.0
+    assert (result.length_error_interval.low, result.length_error_interval.high) == (2.0, 8.0)
+
+
+def test_the_interval_of_a_median_covers_it():
+    """In about 95 % of samples from a known distribution."""
+    rng = np.random.default_rng(0)
+    intervals = [median_interval(rng.exponential(size=80)) for _ in range(200)]
+    covered = np.mean([interval.low <= np.log(2) <= interval.high for interval in intervals])
+    assert 0.88 <= covered <= 0.995

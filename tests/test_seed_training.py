@@ -1,0 +1,228 @@
+"""``lerobot-swr-train``: many seeds at once, each as ``lerobot-train`` would train it."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from conftest import make_batch, train_flags
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import EpisodeAwareSampler
+from lerobot.policies.factory import get_policy_class
+from safetensors.torch import load_file
+
+from lerobot_swr.cli import train as train_command
+from lerobot_swr.training.frame_order import FrameOrder
+from lerobot_swr.training.stacked_policies import StackedPolicies
+
+SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
+
+
+def weights(run: Path, step: int) -> dict[str, torch.Tensor]:
+    """The saved tensors of a run's checkpoint."""
+    return load_file(run / "checkpoints" / f"{step:06d}" / "pretrained_model" / "model.safetensors")
+
+
+def assert_same_files(one: Path, other: Path) -> None:
+    """Weights and the whole training state of two checkpoints are equal, bit for bit."""
+    for name in ("pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors"):
+        expected, found = load_file(one / name), load_file(other / name)
+        assert expected.keys() == found.keys()
+        for key, value in expected.items():
+            assert torch.equal(value, found[key]), (name, key)
+    for name in ("optimizer_param_groups.json", "scheduler_state.json", "training_step.json"):
+        assert (one / "training_state" / name).read_text() == (other / "training_state" / name).read_text()
+
+
+@pytest.fixture
+def swr_train(run_command):
+    """Runs ``lerobot-swr-train`` in this process."""
+
+    def run(*flags: str) -> None:
+        run_command(train_command.main, *flags)
+
+    return run
+
+
+def test_frames_come_in_lerobots_order():
+    """Three epochs, with a smaller last batch, against LeRobot's sampler frame by frame."""
+    starts, ends = [0, 7, 19, 25], [7, 19, 25, 40]
+    sampler = EpisodeAwareSampler(starts, ends, [0, 2, 3], shuffle=True, seed=5)
+    expected = [list(sampler) for _ in range(3)]
+    order = FrameOrder(starts, ends, [0, 2, 3], seed=5, batch_size=8)
+    step, shown = 0, []
+    while step < 3 * order.steps_per_epoch:
+        rows = order.steps(step, 3)
+        step += len(rows)
+        shown += rows.flatten().tolist()
+    assert shown == [row for epoch in expected for row in epoch]
+    assert order.steps(2, 5).shape == (1, 8)
+    assert order.steps(3, 5).shape == (1, 4)
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "options"),
+    [("bc", {}), ("zbc", {}), ("wzbc", {}), ("wzbc", {"partner_sampling": "uniform", "residual": False})],
+)
+def test_losses_and_gradients_are_those_of_a_single_policy(make_tiny_policy, policy_type, options):
+    """On the same batch and partners, parameter by parameter."""
+    policies = [make_tiny_policy(policy_type, seed=seed, **options).train() for seed in range(3)]
+    optimizers = [p.config.get_optimizer_preset().build(p.get_optim_params()) for p in policies]
+    drawn = [policy.draw(make_batch(seed=k)) for k, policy in enumerate(policies)]
+    config = type("Run", (), {"optimizer": policies[0].config.get_optimizer_preset(), "scheduler": None})()
+    stack = StackedPolicies(policies, optimizers, None, config)
+    stacked = {key: torch.stack([one[key] for one in drawn]) for key in drawn[0]}
+    losses, gradients = stack.losses_and_gradients(stacked)
+    for k, policy in enumerate(policies):
+        loss = policy.frame_losses(drawn[k]).mean()
+        loss.backward()
+        torch.testing.assert_close(losses[k], loss)
+        for name, parameter in policy.named_parameters():
+            torch.testing.assert_close(gradients[name][k], parameter.grad, rtol=1e-4, atol=1e-7)
+
+
+def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
+    """A large gradient of one policy is cut to the limit and leaves the other policy's alone."""
+    policies = [make_tiny_policy("zbc", seed=seed, optimizer_grad_clip_norm=1.0).train() for seed in range(2)]
+    drawn = [policy.draw(make_batch(seed=k)) for k, policy in enumerate(policies)]
+    drawn[0]["weight"] *= 0.1
+    drawn[1]["weight"] *= 1000
+    optimizers = [p.config.get_optimizer_preset().build(p.get_optim_params()) for p in policies]
+    config = type("Run", (), {"optimizer": policies[0].config.get_optimizer_preset(), "scheduler": None})()
+    stack = StackedPolicies(policies, optimizers, None, config)
+    stack.step({key: torch.stack([one[key] for one in drawn]) for key in drawn[0]})
+    for policy, optimizer, one in zip(policies, optimizers, drawn, strict=True):
+        policy.frame_losses(one).mean().backward()
+        norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        assert (norm > 1) == (one is drawn[1])
+        optimizer.step()
+    moments = [stack.optimizer_state(k)["state"] for k in range(2)]
+    for k, optimizer in enumerate(optimizers):
+        for i, state in optimizer.state_dict()["state"].items():
+            torch.testing.assert_close(moments[k][i]["exp_avg"], state["exp_avg"], rtol=1e-4, atol=1e-8)
+            assert moments[k][i]["step"] == state["step"] == 1
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "options"),
+    [("bc", ()), ("zbc", ()), ("wzbc", ()), ("wzbc", ("--policy.corrective=demos",))],
+)
+def test_a_seed_is_trained_as_lerobot_train_does(
+    lerobot_train_command, swr_train, small_maze, tmp_path, policy_type, options
+):
+    """Same initial weights, frames, pairs and updates over more than an epoch; equal up to rounding."""
+    flags = [*SMALL, *options, "--policy.flush_denormal=false"]
+    lerobot_train_command(*train_flags(policy_type, small_maze, tmp_path / "one", 70, *flags, "--seed=3"))
+    swr_train(*train_flags(policy_type, small_maze, tmp_path / "all", 70, *flags, "--seeds=1,3", "--jobs=1"))
+    expected, found = weights(tmp_path / "one", 70), weights(tmp_path / "all" / "seed_3", 70)
+    assert expected.keys() == found.keys()
+    for name, value in expected.items():
+        torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-5, msg=name)
+
+
+def test_a_seed_trained_alone_equals_that_seed_among_others(swr_train, small_maze, tmp_path):
+    """Bit for bit, training state included, in one process or in several."""
+    common = ("wzbc", small_maze)
+    swr_train(*train_flags(*common, tmp_path / "alone", 40, *SMALL, "--seeds=2", "--jobs=1"))
+    swr_train(*train_flags(*common, tmp_path / "five", 40, *SMALL, "--seeds=0,1,2,3,4", "--jobs=2"))
+    last = Path("seed_2") / "checkpoints" / "000040"
+    assert_same_files(tmp_path / "alone" / last, tmp_path / "five" / last)
+    assert (
+        weights(tmp_path / "five" / "seed_0", 40).keys() == weights(tmp_path / "five" / "seed_4", 40).keys()
+    )
+
+
+def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path):
+    """kill -9 in the middle, then --resume=true: every seed ends as in an uninterrupted run."""
+    flags = [*SMALL, "--save_freq=20", "--seeds=0,1,2", "--jobs=1"]
+    steps = 400
+    swr_train(*train_flags("wzbc", small_maze, tmp_path / "whole", steps, *flags))
+    killed = train_flags("wzbc", small_maze, tmp_path / "killed", steps, *flags)
+    script = "from lerobot_swr.cli.train import main; main()"
+    process = subprocess.Popen(
+        [sys.executable, "-c", script, *killed],
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    begun = tmp_path / "killed" / "seed_2" / "checkpoints" / "000040"
+    while not begun.is_dir():
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (tmp_path / "killed" / "seed_2" / "checkpoints" / f"{steps:06d}").is_dir()
+    swr_train(*killed, "--resume=true")
+    for seed in range(3):
+        last = Path(f"seed_{seed}") / "checkpoints" / f"{steps:06d}"
+        assert_same_files(tmp_path / "whole" / last, tmp_path / "killed" / last)
+
+
+def test_lerobot_train_goes_on_from_a_seeds_checkpoint(
+    lerobot_train_command, swr_train, small_maze, tmp_path
+):
+    """--resume=true of LeRobot's own command, to the weights that this command ends with."""
+    flags = [*SMALL, "--save_freq=10", "--seeds=4,7", "--jobs=1", "--policy.flush_denormal=false"]
+    swr_train(*train_flags("wzbc", small_maze, tmp_path / "run", 30, *flags))
+    expected = weights(tmp_path / "run" / "seed_7", 30)
+    config = tmp_path / "run/seed_7/checkpoints/000010/pretrained_model/train_config.json"
+    lerobot_train_command(f"--config_path={config}", "--resume=true")
+    for name, value in weights(tmp_path / "run" / "seed_7", 30).items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-3, atol=1e-5, msg=name)
+
+
+def test_finished_seeds_are_left_alone_and_new_ones_added(swr_train, small_maze, tmp_path):
+    """A second command with more seeds trains only those that are missing."""
+    flags = train_flags("zbc", small_maze, tmp_path / "run", 10, *SMALL, "--jobs=1")
+    swr_train(*flags, "--seeds=0")
+    file = tmp_path / "run/seed_0/checkpoints/000010/pretrained_model/model.safetensors"
+    before = file.stat().st_mtime_ns
+    swr_train(*flags, "--seeds=0,1", "--resume=true")
+    assert file.stat().st_mtime_ns == before
+    assert weights(tmp_path / "run" / "seed_1", 10)
+
+
+def test_episodes_that_are_left_out_get_no_style(swr_train, small_maze, tmp_path):
+    """--dataset.episodes: only these episodes' styles are trained."""
+    flags = [*SMALL, "--dataset.episodes=[1,4,5]", "--seeds=0,1", "--jobs=1"]
+    swr_train(*train_flags("wzbc", small_maze, tmp_path / "run", 60, *flags))
+    folder = tmp_path / "run/seed_1/checkpoints/last/pretrained_model"
+    config = PreTrainedConfig.from_pretrained(folder)
+    policy = get_policy_class(config.type).from_pretrained(folder, config=config)
+    assert policy.styles.trained.tolist() == [0, 1, 0, 0, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--seeds=1,1",), r"seeds=\[1, 1\]"),
+        (("--policy.type=act",), "policy.type='act': this command trains bc, zbc and wzbc"),
+        (("--dataset.eval_split=0.2", "--eval_steps=5"), "eval_steps: not available"),
+        (("--jobs=0",), "jobs=0"),
+    ],
+)
+def test_the_impossible_is_refused_before_training(swr_train, small_maze, tmp_path, capfd, flags, message):
+    """The message names key, value and way out; nothing is written."""
+    kept = train_flags("wzbc", small_maze, tmp_path / "run", 5)
+    keys = {flag.partition("=")[0] for flag in flags}
+    with pytest.raises(SystemExit):
+        swr_train(*[flag for flag in kept if flag.partition("=")[0] not in keys], *flags)
+    assert re.search(message, capfd.readouterr().err)
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_existing_folder_and_changed_options_are_refused(swr_train, small_maze, tmp_path, capfd):
+    """Without --resume the folder must be new; with it the options must be those that it was begun with."""
+    flags = train_flags("zbc", small_maze, tmp_path / "run", 6, *SMALL, "--seeds=0", "--jobs=1")
+    swr_train(*flags)
+    with pytest.raises(SystemExit):
+        swr_train(*flags)
+    assert "--resume=true" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        swr_train(*flags, "--resume=true", "--policy.style_dim=4")
+    assert "other values of policy" in capfd.readouterr().err
