@@ -6,7 +6,8 @@ Reading order, along the way data takes:
 * `lerobot_swr.demos`: scripted demonstrators and the recipes that write LeRobot datasets.
 * `lerobot_swr.trajectories`: episodes of a dataset as arrays.
 * `lerobot_swr.similarity`, `lerobot_swr.sampling`, `lerobot_swr.styles`: the method.
-* `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies.
+* `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies, and the baselines BESO, DDPM-GPT, DDPM-ACT.
+* `lerobot_swr.training`: many seeds at once.
 * `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports.
 * `lerobot_swr.cli`: the ``lerobot-swr-*`` commands.
 
@@ -17,4 +18,5 @@ __version__ = "0.1.0"
 
 import lerobot_swr.envs.d3il.configuration_d3il
 import lerobot_swr.envs.maze2d.configuration_maze2d
+import lerobot_swr.policies.baselines.configuration_baselines
 import lerobot_swr.policies.configuration_swr  # noqa: F401

@@ -12,6 +12,7 @@ from lerobot_swr.similarity import Normalization, check_beta, check_normalizatio
 PartnerSampling = Literal["uniform", "weighted"]
 
 MAX_INSPECTED_STYLES = 64
+STEPS_PER_BLOCK = 256  # whose random numbers are drawn together
 
 
 @dataclass(frozen=True)
@@ -65,58 +66,85 @@ class SimilarityWeightedSampler:
         check_normalization(normalization)
         self.beta, self.p = beta, p
         self.normalization, self.partner_sampling = normalization, partner_sampling
-        self._distances = torch.from_numpy(distances).to(torch.float32)  # (N, N)
-        self.candidates = torch.zeros(len(distances), dtype=torch.bool)
-        self._largest = torch.zeros(len(distances))  # (N,) largest distance to a candidate
+        self._distances = distances
+        self._candidates = b""  # what `set_candidates` was given; equal bytes are the quickest comparison
+        self._largest = np.zeros(len(distances))  # (N,) largest distance to a candidate
         self._effective_demos: float | None = None
 
     def set_candidates(self, candidates: Tensor) -> None:
         """Restrict the draw to the episodes marked in `candidates`, (N,), non-zero where marked."""
-        marked = candidates.bool()
-        if torch.equal(marked, self.candidates):
+        given = candidates.cpu().numpy()
+        content = given.tobytes()
+        if content == self._candidates:
             return
-        self._distances = self._distances.to(marked.device)
-        self.candidates = marked.clone()
-        self._candidate_list = marked.nonzero().squeeze(1)  # (M,)
-        self._place = marked.long().cumsum(0) - 1  # (N,) place of a candidate in that list
-        among = self._distances[:, self._candidate_list]  # (N, M)
-        self._largest = among.amax(dim=1)
+        self._candidates, marked = content, given != 0
+        self._candidate_list = np.flatnonzero(marked)  # (M,)
+        self._place = marked.cumsum() - 1  # (N,) place of a candidate in that list
+        self._largest = self._distances[:, self._candidate_list].max(axis=1)
         if self.normalization == "global":
-            self._largest = self._largest[self._candidate_list].amax().expand(len(marked))
+            self._largest = np.full(len(marked), self._largest[self._candidate_list].max())
+        # Shares of the pairs, cumulative over partners: rows are filled when they are needed.
+        self._shares = np.empty((len(marked), len(self._candidate_list)))  # (N, M)
+        self._has_shares = np.zeros(len(marked), dtype=bool)
         self._effective_demos = None
 
-    def nu(self, i: Tensor, j: Tensor) -> Tensor:
+    def nu(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
         """ν(τ_i, τ_j) of pairs of episodes, (B,) each or broadcastable to each other."""
         largest = self._largest[i]
-        return torch.where(largest > 0, self._distances[i, j] / largest, 0.0)
+        return np.divide(self._distances[i, j], largest, where=largest > 0, out=np.zeros(np.shape(i * j)))
 
-    def draw(self, episodes: Tensor, uniforms: Tensor) -> Pairs:
+    def draw(self, episodes: Tensor, uniforms: np.ndarray) -> Pairs:
         """Draw a partner for every frame.
 
         Args:
             episodes: (B,) int64, episode i of each frame; all of them candidates.
             uniforms: (B,) independent numbers, uniform in [0, 1); each decides one frame's partner.
         """
+        # NumPy: on a CPU, torch's overhead for so few numbers would be noticeable in every step.
+        own = episodes.cpu().numpy()
+        if self.p == 0 or len(self._candidate_list) < 2:
+            styles, weights, relabelled = own, np.ones(len(own)), np.zeros(len(own), dtype=bool)
+        elif self.partner_sampling == "uniform":
+            styles, weights, relabelled = self._draw_uniform(own, uniforms)
+        else:
+            styles, weights, relabelled = self._draw_weighted(own, uniforms)
+        device = episodes.device
+        return Pairs(
+            torch.from_numpy(styles).to(device),
+            torch.from_numpy(weights.astype(np.float32)).to(device),
+            torch.from_numpy(relabelled).to(device),
+        )
+
+    def _draw_uniform(
+        self, own: np.ndarray, numbers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         others = len(self._candidate_list) - 1
-        if self.p == 0 or others < 1:
-            ones = torch.ones(len(episodes), device=episodes.device)
-            return Pairs(episodes, ones, torch.zeros_like(episodes, dtype=torch.bool))
-        if self.partner_sampling == "uniform":
-            relabelled = uniforms < self.p
-            place = (uniforms * (others / self.p)).long().clamp_(max=others - 1)
-            place += place >= self._place[episodes]  # skips the frame's own episode
-            styles = torch.where(relabelled, self._candidate_list[place], episodes)
-            weights = torch.exp(-self.beta * self.nu(episodes, styles))
-            return Pairs(styles, weights, relabelled)
-        # (B, M), each pair's share in the expectation: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i
-        shares = torch.exp(-self.beta * self.nu(episodes[:, None], self._candidate_list)) * (self.p / others)
-        shares.scatter_(1, self._place[episodes][:, None], 1 - self.p)
-        cumulative = shares.double().cumsum(dim=1)
-        # Inverse distribution function; below 1, so that rounding never leads past the last share.
-        threshold = uniforms.double().clamp(max=1 - 1e-9)[:, None] * cumulative[:, -1:]
-        place = torch.searchsorted(cumulative, threshold, right=True).squeeze(1).clamp_(max=others)
+        relabelled = numbers < self.p
+        place = np.minimum((numbers * (others / self.p)).astype(np.int64), others - 1)
+        place += place >= self._place[own]  # skips the frame's own episode
+        styles = np.where(relabelled, self._candidate_list[place], own)
+        return styles, np.exp(-self.beta * self.nu(own, styles)), relabelled
+
+    def _draw_weighted(
+        self, own: np.ndarray, numbers: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if not self._has_shares[own].all():
+            self._fill_shares(np.unique(own[~self._has_shares[own]]))
+        shares = self._shares[own]  # (B, M)
+        total = shares[:, -1]
+        # Inverse distribution function; the numbers stay below 1, lest rounding lead past the last share.
+        threshold = np.minimum(numbers, 1 - 1e-9) * total
+        place = np.minimum((shares <= threshold[:, None]).sum(axis=1), shares.shape[1] - 1)
         styles = self._candidate_list[place]
-        return Pairs(styles, cumulative[:, -1].float(), styles != episodes)
+        return styles, total, styles != own
+
+    def _fill_shares(self, episodes: np.ndarray) -> None:
+        """Pairs (i, j) of `episodes`: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i, summed up over j."""
+        others = len(self._candidate_list) - 1
+        shares = np.exp(-self.beta * self.nu(episodes[:, None], self._candidate_list)) * (self.p / others)
+        shares[np.arange(len(episodes)), self._place[episodes]] = 1 - self.p
+        self._shares[episodes] = shares.cumsum(axis=1)
+        self._has_shares[episodes] = True
 
     @property
     def effective_demos(self) -> float:
@@ -131,12 +159,12 @@ class SimilarityWeightedSampler:
     def _count_effective_demos(self) -> float:
         stride = -(-len(self._candidate_list) // MAX_INSPECTED_STYLES)
         styles = self._candidate_list[::stride]
-        weights = torch.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
-        return float((weights.sum(dim=0).square() / weights.square().sum(dim=0)).mean())
+        weights = np.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
+        return float((weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)).mean())
 
 
 class StepGenerator(nn.Module):
-    """A fresh random generator for every training step, a pure function of seed, process and step.
+    """Random numbers of every training step, a pure function of seed, process and step.
 
     Seed and step are buffers, so they travel with a checkpoint and a resumed run draws what the uninterrupted
     one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making
@@ -148,24 +176,45 @@ class StepGenerator(nn.Module):
 
     def __init__(self, stream: int = 0) -> None:
         super().__init__()
-        self._stream = (stream,) if stream else ()
+        self._stream = stream
+        self._blocks: dict[int, tuple[tuple[int, ...], np.ndarray]] = {}  # by count of numbers per step
         self.seed: Tensor
         self.step: Tensor
         self.register_buffer("seed", torch.tensor(torch.initial_seed() % 2**63))
         self.register_buffer("step", torch.tensor(0))
 
     def next(self) -> torch.Generator:
-        """The generator of the next step, on the CPU."""
+        """A generator for the next step, on the CPU."""
+        entropy = self._entropy(int(self.step))
+        self.step += 1
+        seed = np.random.SeedSequence(entropy).generate_state(1, np.uint32)[0]
+        return torch.Generator().manual_seed(int(seed))
+
+    def uniforms(self, steps: int, count: int) -> np.ndarray:
+        """(steps * count,) float64 numbers in [0, 1), `count` for each of the next steps."""
+        first = int(self.step)
+        self.step += steps
+        parts = []
+        while steps > 0:
+            place = first % STEPS_PER_BLOCK
+            parts.append(self._block(first // STEPS_PER_BLOCK, count)[place : place + steps])
+            first, steps = first + len(parts[-1]), steps - len(parts[-1])
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(-1)
+
+    def _block(self, block: int, count: int) -> np.ndarray:
+        """(STEPS_PER_BLOCK, count) numbers of consecutive steps; drawn together they cost little more."""
+        entropy = self._entropy(block)
+        known = self._blocks.get(count)
+        if known is None or known[0] != entropy:
+            generator = np.random.default_rng([*entropy, count])
+            known = (entropy, generator.random((STEPS_PER_BLOCK, count)))
+            self._blocks = {**{k: v for k, v in self._blocks.items() if v[0] == entropy}, count: known}
+        return known[1]
+
+    def _entropy(self, place: int) -> tuple[int, ...]:
         distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
         process = torch.distributed.get_rank() if distributed else 0
-        entropy = np.random.SeedSequence((int(self.seed), process, int(self.step), *self._stream))
-        self.step += 1
-        return torch.Generator().manual_seed(int(entropy.generate_state(1, np.uint32)[0]))
-
-    def uniforms(self, steps: int, count: int) -> Tensor:
-        """(steps * count,) numbers in [0, 1), `count` from the generator of each of the next steps."""
-        drawn = [torch.rand(count, generator=self.next(), dtype=torch.float64) for _ in range(steps)]
-        return torch.cat(drawn)
+        return int(self.seed), process, place, self._stream
 
 
 def check_probability(p: float) -> None:

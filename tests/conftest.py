@@ -19,6 +19,8 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 
 SMALL_MAZE = {"10": 4, "20": 2}  # behaviour -> number of episodes
+OBSERVATIONS = ("observation.state", "observation.environment_state")
+WINDOW, CHUNK = 5, 4  # of the baselines
 
 
 @pytest.fixture(scope="session")
@@ -55,6 +57,39 @@ def make_batch(n_frames: int = 32, n_episodes: int = 6, seed: int = 1) -> dict[s
         "observation.environment_state": torch.randn(n_frames, 2, generator=generator),
         "action": torch.randn(n_frames, 2, generator=generator),
         "episode_index": torch.arange(n_frames) % n_episodes,
+    }
+
+
+@pytest.fixture
+def make_baseline(small_maze_meta: LeRobotDatasetMetadata) -> Callable[..., PreTrainedPolicy]:
+    """Builds a small baseline on `small_maze` through LeRobot's factory, the same for the same seed."""
+
+    def make(policy_type: str, seed: int = 0, **options) -> PreTrainedPolicy:
+        torch.manual_seed(seed)
+        options = {"dim_model": 16, "n_heads": 2, "device": "cpu", "push_to_hub": False, **options}
+        policy = make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
+        with torch.no_grad():  # as initialised, the networks say almost nothing
+            for parameter in policy.network.parameters():
+                parameter.add_(0.3 * torch.randn_like(parameter))
+        policy.average.module.load_state_dict(policy.network.state_dict())
+        return policy.eval()
+
+    return make
+
+
+def make_windows(n_windows: int = 32, policy_type: str = "beso", n_pads: int = 0, seed: int = 1) -> dict:
+    """A batch of normalised windows of the small maze's dimensions, the first `n_pads` steps padded."""
+    generator = torch.Generator().manual_seed(seed)
+    n_actions = CHUNK if policy_type == "ddpm_act" else WINDOW
+    batch = {key: torch.randn(n_windows, WINDOW, 2, generator=generator) for key in OBSERVATIONS}
+    before = torch.arange(WINDOW).expand(n_windows, -1) < n_pads
+    # A chunk's padding comes after the episode's end, a window's before its start.
+    after = torch.arange(CHUNK, 0, -1).expand(n_windows, -1) <= n_pads
+    return {
+        **batch,
+        "action": torch.randn(n_windows, n_actions, 2, generator=generator),
+        "observation.state_is_pad": before,
+        "action_is_pad": after if policy_type == "ddpm_act" else before,
     }
 
 

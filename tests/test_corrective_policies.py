@@ -125,7 +125,7 @@ def test_corrective_frames_are_normalised_as_lerobot_normalises(small_maze, mode
     corrections = copy.deepcopy(policy.corrections)
     drawn = policy.draw(batch)
     n, per_frame = len(batch["index"]), corrections.labels.draws_per_frame
-    uniforms = corrections.draws.uniforms(1, n * per_frame).view(n, per_frame)
+    uniforms = torch.from_numpy(corrections.draws.uniforms(1, n * per_frame)).view(n, per_frame)
     raw = corrections.labels.relabel(batch["index"], uniforms, torch.arange(6))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     expected = preprocessor({**raw.observations, ACTION: raw.actions})

@@ -15,7 +15,8 @@ GENERATOR = torch.Generator()
 
 def draw(sampler, episodes):
     """Pairs from fresh uniform numbers."""
-    return sampler.draw(episodes, torch.rand(len(episodes), generator=GENERATOR, dtype=torch.float64))
+    uniforms = torch.rand(len(episodes), generator=GENERATOR, dtype=torch.float64)
+    return sampler.draw(episodes, uniforms.numpy())
 
 
 def make_sampler(**options) -> SimilarityWeightedSampler:
@@ -81,7 +82,7 @@ def test_only_candidates_are_drawn_and_normalise(partner_sampling):
     sampler.set_candidates(torch.tensor([1, 0, 1, 1, 0]))
     pairs = draw(sampler, torch.tensor([0, 2, 3]).repeat(300))
     assert set(pairs.styles.tolist()) == {0, 2, 3}
-    assert float(sampler.nu(torch.tensor(0), torch.tensor(3))) == 1.0
+    assert float(sampler.nu(np.array(0), np.array(3))) == 1.0
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])

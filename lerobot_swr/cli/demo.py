@@ -138,26 +138,37 @@ def _train_all(trainings: list[Training], jobs: int) -> None:
     """
     waiting = [training for training in trainings if not training.checkpoint.is_dir()]
     total = sum(training.steps for training in waiting)
+    running: set[subprocess.Popen] = set()
     with ThreadPoolExecutor(jobs) as pool, tqdm(total=total, desc="Training", unit="step") as bar:
-        futures = [pool.submit(_train, training) for training in waiting]
-        while not all(future.done() for future in futures):
-            time.sleep(1)
-            bar.update(sum(map(_steps_done, waiting)) - bar.n)
-        for future in as_completed(futures):
-            future.result()
+        futures = [pool.submit(_train, training, running) for training in waiting]
+        try:
+            while not all(future.done() for future in futures):
+                time.sleep(1)
+                bar.update(sum(map(_steps_done, waiting)) - bar.n)
+            for future in as_completed(futures):
+                future.result()
+        except BaseException:  # Ctrl-C or a failure: end what is under way instead of waiting for it
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in running:
+                process.terminate()
+            raise
 
 
-def _train(training: Training) -> None:
+def _train(training: Training, running: set[subprocess.Popen]) -> None:
     if training.output_dir.exists():  # an interrupted run
         shutil.rmtree(training.output_dir)
     training.log.parent.mkdir(parents=True, exist_ok=True)
     one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     executable = Path(sys.executable).with_name(training.command[0])
-    with training.log.open("w") as log:
-        run = subprocess.run(
-            [str(executable), *training.command[1:]], stdout=log, stderr=subprocess.STDOUT, env=one_thread
-        )
-    if run.returncode != 0:
+    command = [str(executable), *training.command[1:]]
+    with (
+        training.log.open("w") as log,
+        subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=one_thread) as process,
+    ):
+        running.add(process)
+        status = process.wait()
+        running.discard(process)
+    if status != 0:
         raise ChildProcessError(
             f"training {training.policy} on {training.dataset} failed: see {training.log}"
         )

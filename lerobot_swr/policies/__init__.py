@@ -1,1 +1,1 @@
-"""The policies BC, ZBC and WZBC as LeRobot's configuration / modeling / processor trio."""
+"""BC, ZBC and WZBC as LeRobot's configuration / modeling / processor trio; `baselines` beside them."""

@@ -5,15 +5,12 @@ Denoyer; arXiv 2504.18160), "the paper". Defaults are the paper's values, except
 otherwise; `docs/method.md` gives the reasons and the flags of the paper's literal network.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
-from lerobot.optim import LRSchedulerConfig, OptimizerConfig
-from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_STATE
+from lerobot.configs import PreTrainedConfig
 
-from lerobot_swr.configuration import check_dataset_folder, tells_bad_values
-from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
+from lerobot_swr.configuration import tells_bad_values
+from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import check_beta, check_normalization
 from lerobot_swr.style_selection import StyleSelection
@@ -22,10 +19,11 @@ from lerobot_swr.styles import check_style_sampling
 
 @PreTrainedConfig.register_subclass("bc")
 @dataclass
-class BCConfig(PreTrainedConfig):
+class BCConfig(StateConfig):
     """Behaviour cloning with a deterministic policy: the baseline without styles.
 
-    Args of `PreTrainedConfig` apply; every other field is documented where it is defined.
+    Args of `StateConfig` apply (the paper's learning rate is constant); every other field is documented where
+    it is defined.
     """
 
     # --- Network ---
@@ -38,27 +36,9 @@ class BCConfig(PreTrainedConfig):
     residual: bool = True
 
     # --- Training ---
-    # Adam's learning rate.
-    optimizer_lr: float = 1e-3
-    optimizer_betas: tuple[float, float] = (0.9, 0.999)
-    optimizer_weight_decay: float = 0.0
-    optimizer_grad_clip_norm: float = 10.0
-    # "cosine" (to 0 at the run's last step, whatever --steps is) or "constant" (the paper).
-    lr_schedule: str = "cosine"
     # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
     # uniformly, which favours long episodes).
     balance_episodes: bool = True
-    # Treat numbers below 1e-38 as 0 in this process; they make the CPU several times slower.
-    flush_denormal: bool = True
-
-    # --- Normalization ---
-    normalization_mapping: dict[str, NormalizationMode] = field(
-        default_factory=lambda: {
-            "STATE": NormalizationMode.MEAN_STD,
-            "ENV": NormalizationMode.MEAN_STD,
-            "ACTION": NormalizationMode.MEAN_STD,
-        }
-    )
 
     # --- Set from the dataset; not meant to be given ---
     # Number of episodes of the training dataset.
@@ -74,64 +54,7 @@ class BCConfig(PreTrainedConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
-        check_dataset_folder()
-        for key in ("hidden_dim", "num_hidden"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
-        if not self.optimizer_lr > 0:
-            raise ValueError(f"optimizer_lr={self.optimizer_lr}: expected a number > 0")
-        if self.lr_schedule not in ("cosine", "constant"):
-            raise ValueError(f"lr_schedule={self.lr_schedule!r}: expected 'cosine' or 'constant'")
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """Only the current observation is used."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> None:
-        """Only the current action is predicted."""
-        return None
-
-    @property
-    def reward_delta_indices(self) -> None:
-        """Rewards are not used."""
-        return None
-
-    @property
-    def observation_keys(self) -> list[str]:
-        """Names of the low-dimensional observations, in the order in which the network sees them."""
-        inputs = self.input_features or {}
-        return [key for key, ft in inputs.items() if ft.type in (FeatureType.STATE, FeatureType.ENV)]
-
-    def get_optimizer_preset(self) -> OptimizerConfig:
-        """Fused Adam."""
-        return FusedAdamConfig(
-            lr=self.optimizer_lr,
-            betas=self.optimizer_betas,
-            weight_decay=self.optimizer_weight_decay,
-            grad_clip_norm=self.optimizer_grad_clip_norm,
-        )
-
-    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
-        """The learning rate's schedule; it ends with the run."""
-        if self.lr_schedule == "constant":
-            return None
-        return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=0)
-
-    def validate_features(self) -> None:
-        """Check that the dataset has what the policy needs.
-
-        Raises:
-            ValueError: If it has no ``observation.state`` or no ``action``.
-        """
-        if self.robot_state_feature is None:
-            raise ValueError(
-                f"policy {self.type!r} needs the feature {OBS_STATE!r}; the dataset has: "
-                f"{', '.join(self.input_features or {})} (rename the feature in the dataset)"
-            )
-        if self.action_feature is None:
-            raise ValueError(f"policy {self.type!r} needs the feature 'action'; the dataset has none")
+        self.check_at_least_one("hidden_dim", "num_hidden")
 
 
 @PreTrainedConfig.register_subclass("zbc")

@@ -101,7 +101,8 @@ class Corrections(nn.Module):
             return self.encode(drawn)
         device, per_frame = rows.device, self.labels.draws_per_frame
         self.labels.to(device)
-        uniforms = self.draws.uniforms(steps, len(rows) // steps * per_frame).view(-1, per_frame)
+        numbers = self.draws.uniforms(steps, len(rows) // steps * per_frame)
+        uniforms = torch.from_numpy(numbers.reshape(-1, per_frame))
         corrected = self.labels.relabel(rows, uniforms.to(device), trained.nonzero().squeeze(1))
         raw = {**corrected.observations, ACTION: corrected.actions}
         new = {key: self._units[key].to(device).normalize(value) for key, value in raw.items()}

@@ -47,8 +47,6 @@ class BCPolicy(DatasetPolicy):
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta)
-        if config.flush_denormal:
-            torch.set_flush_denormal(True)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
 
@@ -58,12 +56,11 @@ class BCPolicy(DatasetPolicy):
 
     def _make_network(self) -> ActionNetwork:
         config = self.config
-        inputs = cast(dict, config.input_features)
         return ActionNetwork(
             config.observation_keys,
-            sum(inputs[key].shape[0] for key in config.observation_keys),
+            config.observation_dim,
             self._style_dim,
-            config.action_feature.shape[0],  # type: ignore[union-attr]
+            config.action_dim,
             config.hidden_dim,
             config.num_hidden,
             config.residual,
@@ -420,8 +417,7 @@ class WZBCPolicy(ZBCPolicy):
         if self.sampler is None:
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
-        uniforms = self.draws.uniforms(steps, len(episodes) // steps).to(episodes.device)
-        pairs = self.sampler.draw(episodes, uniforms)
+        pairs = self.sampler.draw(episodes, self.draws.uniforms(steps, len(episodes) // steps))
         weight = drawn["weight"] * pairs.weights
         return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
 
@@ -446,13 +442,14 @@ class WZBCPolicy(ZBCPolicy):
         p = self.config.p
         figures = {"effective_demos": self.sampler.effective_demos, **super().figures(drawn, losses)}
         # NumPy: torch's overhead for so few numbers would be noticeable in every step.
+        values, weights = losses.cpu().numpy(), drawn["weight"].cpu().numpy()
         relabelled = drawn["relabelled"].cpu().numpy()
-        own, share = ~relabelled, 1.0
+        own, share = ~relabelled, float(len(values))
         if "corrective" in drawn:
-            own, share = own & ~drawn["corrective"].cpu().numpy(), 1 - SHARE
+            own, share = own & ~drawn["corrective"].cpu().numpy(), share * (1 - SHARE)
         if p < 1:
-            figures["own_style_loss"] = float((losses.cpu().numpy() * own).mean()) / (1 - p) / share
+            figures["own_style_loss"] = float(values @ own) / share / (1 - p)
         if p > 0:
-            figures["relabelled_loss"] = float((losses.cpu().numpy() * relabelled).mean()) / p / share
-            figures["mean_weight"] = float((drawn["weight"].cpu().numpy() * relabelled).mean()) / p / share
+            figures["relabelled_loss"] = float(values @ relabelled) / share / p
+            figures["mean_weight"] = float(weights @ relabelled) / share / p
         return figures

@@ -6,7 +6,7 @@ import numpy as np
 from lerobot.lerobot_types import PolicyAction
 from lerobot.processor import PolicyProcessorPipeline, make_default_pre_post_processors
 
-from lerobot_swr.policies.configuration_swr import BCConfig
+from lerobot_swr.policies.state_config import StateConfig
 
 Pipelines = tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
@@ -15,7 +15,7 @@ Pipelines = tuple[
 Statistics = dict[str, dict[str, Any]]
 
 
-def make_bc_pre_post_processors(config: BCConfig, dataset_stats: Statistics | None = None) -> Pipelines:
+def make_bc_pre_post_processors(config: StateConfig, dataset_stats: Statistics | None = None) -> Pipelines:
     """LeRobot's default pipelines; constant dimensions are centred instead of being blown up."""
     return make_default_pre_post_processors(config, _with_unit_std_where_constant(config, dataset_stats))
 
@@ -24,7 +24,7 @@ make_zbc_pre_post_processors = make_bc_pre_post_processors
 make_wzbc_pre_post_processors = make_bc_pre_post_processors
 
 
-def _with_unit_std_where_constant(config: BCConfig, stats: Statistics | None) -> Statistics | None:
+def _with_unit_std_where_constant(config: StateConfig, stats: Statistics | None) -> Statistics | None:
     """Set the standard deviation of constant dimensions to 1.
 
     LeRobot divides by std + 1e-8, so the rounding error of a constant's mean would become an input or a

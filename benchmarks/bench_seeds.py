@@ -1,0 +1,76 @@
+"""Seed-steps per second of `lerobot-swr-train` beside `lerobot-train`, for wzbc on medium_maze-only_forward.
+
+One run after the other, each on all cores of the machine as its defaults have it; the rate of
+`lerobot-swr-train` is that between two checkpoints, which leaves out start-up, as LeRobot's own figures do.
+"""
+
+import argparse
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from lerobot_swr.demos.catalog import get_recipe
+from lerobot_swr.demos.dataset_writer import write_dataset
+
+SEEDS = (0, 1, 2, 3, 4)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=6000, help="of lerobot-swr-train, per seed")
+    steps = parser.parse_args().steps
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder) / "only_forward"
+        write_dataset(get_recipe("medium_maze-only_forward"), root)
+        single = lerobot_train(root, Path(folder) / "single", steps // 5)
+        print(f"lerobot-train:     {single:7.1f} steps/s", flush=True)
+        many = seed_train(root, Path(folder) / "many", steps)
+        print(f"lerobot-swr-train: {many:7.1f} seed-steps/s ({len(SEEDS)} seeds), {many / single:.1f} times")
+
+
+def flags(root: Path, output_dir: Path, steps: int) -> list[str]:
+    return [
+        *("--policy.type=wzbc", "--policy.device=cpu", "--policy.push_to_hub=false"),
+        *("--dataset.repo_id=local/only_forward", f"--dataset.root={root}", "--batch_size=16"),
+        *("--num_workers=0", f"--steps={steps}", f"--output_dir={output_dir}"),
+    ]
+
+
+def run(command: str, *arguments: str) -> str:
+    executable = str(Path(sys.executable).with_name(command))
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
+    done = subprocess.run([executable, *arguments], capture_output=True, text=True, env=environment)
+    if done.returncode != 0:
+        sys.exit(done.stderr[-3000:])
+    return done.stdout + done.stderr
+
+
+def lerobot_train(root: Path, output_dir: Path, steps: int) -> float:
+    """Steps/s of the second half of the run."""
+    more = (f"--log_freq={steps // 2}", "--save_checkpoint=false")
+    log = run("lerobot-train", *flags(root, output_dir, steps), *more)
+    update, data = (float(value) for value in re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", log)[-1])
+    return 1 / (update + data)
+
+
+def seed_train(root: Path, output_dir: Path, steps: int) -> float:
+    """Seed-steps/s between the first checkpoint of the last group to start and the end of the last one."""
+    first = steps // 4
+    more = (f"--seeds={','.join(map(str, SEEDS))}", "--log_freq=0", f"--save_freq={first}")
+    run("lerobot-swr-train", *flags(root, output_dir, steps), *more)
+    state = "training_state/training_step.json"
+    times = {
+        step: [
+            (output_dir / f"seed_{s}/checkpoints/{step:06d}" / state).stat().st_mtime_ns / 1e9 for s in SEEDS
+        ]
+        for step in (first, 2 * first, 3 * first)
+    }
+    # Each seed's own rate between its second and third checkpoint, in which all groups are under way.
+    return sum(first / (end - start) for start, end in zip(times[2 * first], times[3 * first], strict=True))
+
+
+if __name__ == "__main__":
+    main()

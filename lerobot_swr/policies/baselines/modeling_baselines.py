@@ -1,0 +1,305 @@
+"""The policies ``ddpm_gpt``, ``ddpm_act`` and ``beso``."""
+
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor, nn
+
+from lerobot_swr.policies.baselines.averaging import moving_average
+from lerobot_swr.policies.baselines.configuration_baselines import (
+    BesoConfig,
+    DdpmActConfig,
+    DdpmGptConfig,
+    WindowDiffusionConfig,
+)
+from lerobot_swr.policies.baselines.diffusion import Bounds, Ddpm, Generators, Karras, Noised
+from lerobot_swr.policies.baselines.history import ObservationHistory
+from lerobot_swr.policies.baselines.processor_baselines import make_beso_pre_post_processors
+from lerobot_swr.policies.baselines.transformers import (
+    ChunkEncoderDecoder,
+    NoiseLevelEmbedding,
+    StepEmbedding,
+    Trunk,
+    WindowGPT,
+)
+from lerobot_swr.policies.network import ObservationEncoder
+from lerobot_swr.policies.processor_swr import Statistics
+from lerobot_swr.policies.state_policy import StatePolicy
+from lerobot_swr.sampling import StepGenerator
+
+PAD = f"{OBS_STATE}_is_pad"
+ACTION_PAD = f"{ACTION}_is_pad"
+
+
+class WindowDiffusionPolicy(StatePolicy):
+    """Denoises actions, given a window of observations, with a transformer.
+
+    Attributes:
+        network: What is trained.
+        average: The moving average of its weights, which acts and on which held-out losses are taken.
+
+    Args:
+        config: The policy's configuration.
+        dataset_stats: Statistics of the training dataset, for the bounds of the actions; absent at inference.
+        **kwargs: Whatever else LeRobot's factory passes (``dataset_meta``).
+
+    Raises:
+        ModuleNotFoundError: If diffusers is not installed.
+        ValueError: If the dataset lacks ``observation.state`` or ``action``.
+    """
+
+    config_class = WindowDiffusionConfig
+    name = "window_diffusion"  # LeRobot wants one of every class; policies have their own
+    config: WindowDiffusionConfig
+
+    def __init__(self, config: WindowDiffusionConfig, dataset_stats: Statistics | None = None, **kwargs: Any):
+        super().__init__(config)
+        self.encoder = ObservationEncoder(config.observation_keys)
+        self.network = self._make_network()
+        self.average = moving_average(self.network, config.ema_decay)
+        self.process = self._make_process()
+        self.draws = StepGenerator()
+        self.action_low: Tensor
+        self.action_high: Tensor
+        self.register_buffer("action_low", torch.full((config.action_dim,), -torch.inf))
+        self.register_buffer("action_high", torch.full((config.action_dim,), torch.inf))
+        self._has_dataset = dataset_stats is not None
+        if dataset_stats is not None:
+            self._set_bounds(dataset_stats)
+        self.reset()
+
+    @abstractmethod
+    def _make_network(self) -> nn.Module:
+        """The denoising network."""
+
+    @abstractmethod
+    def _make_process(self) -> Ddpm | Karras:
+        """The diffusion process."""
+
+    @property
+    @abstractmethod
+    def _n_actions(self) -> int:
+        """K, actions that are denoised together."""
+
+    def _set_bounds(self, stats: Statistics) -> None:
+        """Remember the range of the demonstrations' normalised actions."""
+        normalize, _ = make_beso_pre_post_processors(self.config, stats)
+        keys = [*self.config.observation_keys, ACTION]
+        for bound, extreme in ((self.action_low, "min"), (self.action_high, "max")):
+            raw = {key: torch.as_tensor(stats[key][extreme], dtype=torch.float32) for key in keys}
+            bound.copy_(normalize(raw)[ACTION].reshape(-1))
+
+    # --- LeRobot's training interface ---
+
+    def get_optim_params(self) -> Any:
+        """The network's parameters; its average is not trained."""
+        return self.network.parameters()
+
+    def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Training loss of a batch of windows.
+
+        In evaluation mode the average's loss is taken, with the same noise every time.
+
+        Args:
+            batch: Normalised observations (B, T, d), ``action`` (B, K, A), and what LeRobot's datasets say
+                about steps beyond the episode, ``observation.state_is_pad`` (B, T), ``action_is_pad`` (B, K).
+            reduction: ``mean``, or ``none`` for one loss per window.
+
+        Returns:
+            The loss, scalar or (B,), and no further figures. Steps beyond the episode add nothing to it.
+        """
+        draws = self.config.noise_draws  # R
+        observations, actions, is_pad, action_is_pad = (
+            x.repeat_interleave(draws, dim=0)
+            for x in (self.encoder(batch), batch[ACTION], batch[PAD], batch[ACTION_PAD])
+        )
+        with self._own_draws(actions.device):
+            noised: Noised = self.process.noised(actions)
+            network = self.network if self.training else self.average
+            predicted = network(observations, noised.inputs, noised.level, is_pad)
+        errors = (predicted - noised.target).square().mean(dim=-1)  # (B R, K)
+        losses = (errors * ~action_is_pad).reshape(len(batch[ACTION]), -1).mean(dim=-1)
+        return (losses if reduction == "none" else losses.mean()), {}
+
+    @contextmanager
+    def _own_draws(self, device: torch.device) -> Iterator[None]:
+        """Make torch's global generators draw, for noise and dropout, what depends on the step alone.
+
+        So that a resumed run draws what an uninterrupted one does, see `StepGenerator`.
+        """
+        seed = self.draws.next().initial_seed() if self.training else int(self.draws.seed)
+        with torch.random.fork_rng([device] if device.type == "cuda" else []):
+            torch.manual_seed(seed)
+            yield
+
+    def update(self) -> None:
+        """Go on with the average; LeRobot calls this after every step of the optimizer."""
+        self.average.update_parameters(self.network)
+
+    # --- LeRobot's inference interface ---
+
+    def reset(self) -> None:
+        """Start a rollout."""
+        self.history = ObservationHistory(self.config.observation_keys, self.config.n_obs_steps)
+        self._planned: deque[Tensor] = deque()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, A) normalised actions for normalised current observations (B, d)."""
+        self.history.push(batch)
+        if not self._planned:
+            self._planned.extend(self.sample(self.history.window()).unbind(dim=1))
+        return self._planned.popleft()
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """(B, C, A) normalised actions from the current one on, for normalised observations (B, d).
+
+        The observations become part of the rollout's history, as with `select_action`.
+        """
+        self.history.push(batch)
+        return self.sample(self.history.window())
+
+    def sample(self, window: dict[str, Tensor], generator: Generators = None) -> Tensor:
+        """(B, C, A) actions to execute, given a window as `ObservationHistory.window` has it."""
+        observations, is_pad = self.encoder(window), window["is_pad"]
+        like = observations.new_empty(len(observations), self._n_actions, self.config.action_dim)
+        start = self._start(self.process.prior(like, generator))
+        actions = self.process.denoise(
+            lambda noised, level: self.average(observations, noised, level, is_pad),
+            start,
+            Bounds(self.action_low, self.action_high),
+            generator,
+        )
+        return self._executed(actions)
+
+    def _start(self, noise: Tensor) -> Tensor:
+        """(B, K, A), where denoising starts."""
+        return noise
+
+    def _executed(self, actions: Tensor) -> Tensor:
+        """(B, C, A), the part of (B, K, A) denoised actions that is executed."""
+        return actions
+
+    # --- Checkpoints ---
+
+    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """On a dataset, which need not be the checkpoint's, its own bounds of the actions hold."""
+        if not self._has_dataset:
+            return state
+        return {**state, "action_low": self.action_low, "action_high": self.action_high}
+
+
+class DdpmGptPolicy(WindowDiffusionPolicy):
+    """DDPM-GPT: denoises the actions of the whole window and executes the last one."""
+
+    config_class = DdpmGptConfig
+    name = "ddpm_gpt"
+    config: DdpmGptConfig
+
+    def _make_network(self) -> WindowGPT:
+        config = self.config
+        trunk = Trunk(
+            config.dim_model,
+            config.n_layers,
+            config.n_heads,
+            config.attention_dropout,
+            config.residual_dropout,
+        )
+        return WindowGPT(
+            config.observation_dim,
+            config.action_dim,
+            config.n_obs_steps,
+            trunk,
+            config.dim_model,
+            self._make_level_embedding(),
+        )
+
+    def _make_level_embedding(self) -> nn.Module:
+        return StepEmbedding(self.config.dim_model)
+
+    def _make_process(self) -> Ddpm | Karras:
+        return Ddpm(self.config.denoising_steps)
+
+    @property
+    def _n_actions(self) -> int:
+        return self.config.n_obs_steps
+
+    def _executed(self, actions: Tensor) -> Tensor:
+        return actions[:, -1:]
+
+
+class DdpmActPolicy(WindowDiffusionPolicy):
+    """DDPM-ACT: denoises a chunk of actions with an encoder-decoder and executes all of it."""
+
+    config_class = DdpmActConfig
+    name = "ddpm_act"
+    config: DdpmActConfig
+
+    def _make_network(self) -> ChunkEncoderDecoder:
+        config = self.config
+        encoder = Trunk(
+            config.dim_model,
+            config.n_encoder_layers,
+            config.n_heads,
+            config.attention_dropout,
+            config.residual_dropout,
+        )
+        return ChunkEncoderDecoder(
+            config.observation_dim,
+            config.action_dim,
+            config.n_obs_steps,
+            config.chunk_size,
+            encoder,
+            config.n_decoder_layers,
+            config.dim_model,
+            config.n_heads,
+            config.attention_dropout,
+            config.residual_dropout,
+            StepEmbedding(config.dim_model),
+        )
+
+    def _make_process(self) -> Ddpm:
+        return Ddpm(self.config.denoising_steps)
+
+    @property
+    def _n_actions(self) -> int:
+        return self.config.chunk_size
+
+
+class BesoPolicy(DdpmGptPolicy):
+    """BESO: DDPM-GPT's network as a score model of continuous noise levels.
+
+    At inference the window's earlier actions start from those that were executed, without noise, and are
+    denoised along, as in D3IL's agent.
+    """
+
+    config_class = BesoConfig
+    name = "beso"
+    config: BesoConfig
+
+    def _make_level_embedding(self) -> nn.Module:
+        return NoiseLevelEmbedding(self.config.dim_model)
+
+    def _make_process(self) -> Karras:
+        config = self.config
+        return Karras(config.denoising_steps, config.sigma_data, config.sigma_min, config.sigma_max)
+
+    def reset(self) -> None:
+        """Start a rollout."""
+        super().reset()
+        self._past: deque[Tensor] = deque(maxlen=self.config.n_obs_steps - 1)
+
+    def _start(self, noise: Tensor) -> Tensor:
+        if self._past:
+            noise[:, -1 - len(self._past) : -1] = torch.stack(list(self._past), dim=1)
+        return noise
+
+    def _executed(self, actions: Tensor) -> Tensor:
+        self._past.append(actions[:, -1])
+        return super()._executed(actions)
