@@ -1,4 +1,4 @@
-"""Cost of a training step of WZBC beside ZBC, in turns, on one thread.
+"""Cost of a training step of WZBC, and of ZBC with corrective labels, beside ZBC, in turns, on one thread.
 
 Twice: the bare step (forward, backward, fused Adam), and the step as `lerobot-train` takes it, which clips
 gradients and keeps metrics, too; loading the batch is left out of both.
@@ -23,6 +23,12 @@ from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 
 ROUNDS, STEPS, BATCH = 15, 200, 16
+RUNS: dict[str, tuple[str, dict]] = {
+    "zbc": ("zbc", {}),
+    "wzbc": ("wzbc", {}),
+    "zbc corrective=noise": ("zbc", {"corrective": "noise"}),
+    "zbc corrective=demos": ("zbc", {"corrective": "demos"}),
+}
 METERS = ("loss", "grad_norm", "lr", "update_s")
 
 
@@ -33,11 +39,18 @@ def main() -> None:
         write_dataset(get_recipe("medium_maze-only_forward"), root)
         meta = LeRobotDatasetMetadata("local/only_forward", root=root)
         policies = {
-            policy_type: make_policy(make_policy_config(policy_type, device="cpu"), ds_meta=meta).train()
-            for policy_type in ("zbc", "wzbc")
+            name: make_policy(make_policy_config(policy_type, device="cpu", **options), ds_meta=meta).train()
+            for name, (policy_type, options) in RUNS.items()
         }
-    compare("bare step", {name: bare_step(policy) for name, policy in policies.items()})
-    compare("step of lerobot-train", {name: lerobot_step(policy) for name, policy in policies.items()})
+    frames = torch.repeat_interleave(
+        torch.arange(100), torch.from_numpy(policies["zbc"].trajectories.lengths)
+    )
+    for policy in policies.values():
+        policy.styles.mark_trained(torch.arange(100))
+    compare("bare step", {name: bare_step(policy) for name, policy in policies.items()}, frames)
+    compare(
+        "step of lerobot-train", {name: lerobot_step(policy) for name, policy in policies.items()}, frames
+    )
 
 
 def bare_step(policy: torch.nn.Module) -> Callable[[dict], None]:
@@ -67,7 +80,8 @@ def lerobot_step(policy: torch.nn.Module) -> Callable[[dict], None]:
     return step
 
 
-def compare(title: str, steps: dict[str, Callable[[dict], None]]) -> None:
+def compare(title: str, steps: dict[str, Callable[[dict], None]], frames: torch.Tensor) -> None:
+    """Time the steps in turns; `frames` (F,) is the episode of every frame."""
     batch = {
         "observation.state": torch.randn(BATCH, 2),
         "observation.environment_state": torch.zeros(BATCH, 2),
@@ -78,14 +92,16 @@ def compare(title: str, steps: dict[str, Callable[[dict], None]]) -> None:
         for name, step in steps.items():
             start = time.perf_counter()
             for _ in range(STEPS):
-                batch["episode_index"] = torch.randint(100, (BATCH,))
+                batch["index"] = torch.randint(len(frames), (BATCH,))
+                batch["episode_index"] = frames[batch["index"]]
                 step(batch)
             seconds[name].append((time.perf_counter() - start) / STEPS)
     for name, values in seconds.items():
         print(f"{title}, {name}: {1e3 * np.median(values):.2f} ms, {1 / np.median(values):.0f} steps/s")
-    ratios = np.array(seconds["wzbc"]) / np.array(seconds["zbc"])
-    low, high = ratios.min(), ratios.max()
-    print(f"wzbc / zbc: median {np.median(ratios):.3f} of {ROUNDS} paired rounds ({low:.3f} to {high:.3f})")
+    for name in list(steps)[1:]:
+        ratios = np.array(seconds[name]) / np.array(seconds["zbc"])
+        low, high, middle = ratios.min(), ratios.max(), np.median(ratios)
+        print(f"{name} / zbc: median {middle:.3f} of {ROUNDS} paired rounds ({low:.3f} to {high:.3f})")
 
 
 if __name__ == "__main__":

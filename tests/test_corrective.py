@@ -222,9 +222,9 @@ def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
     paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
     uniforms = torch.rand(500, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0)).double()
     rows, matched = paths.draw_partners(torch.zeros(500, dtype=torch.int64), torch.arange(6), 0.1, uniforms)
-    away_from_the_turn = (paths.phase(rows) - 0.5).abs() > 0.3
+    away_from_the_turn = (paths.phase[rows] - 0.5).abs() > 0.3
     assert away_from_the_turn.sum() > 100
-    same_way = (paths.phase(rows) > 0.5) == (paths.phase(matched) > 0.5)
+    same_way = (paths.phase[rows] > 0.5) == (paths.phase[matched] > 0.5)
     assert same_way[away_from_the_turn].all()
 
 
@@ -270,7 +270,7 @@ def test_labels_beside_the_path_lead_back_to_it(maze):
         states = states + MAX_STEP * feedback.act(states, matched).clamp(-1, 1)
     after = (states - feedback.paths.states[feedback.paths.nearest(states, matched)]).norm(dim=1)
     assert after.mean() < before.mean() / 3
-    assert (feedback.paths.phase(matched) > feedback.paths.phase(rows)).float().mean() > 0.9
+    assert (feedback.paths.phase[matched] > feedback.paths.phase[rows]).float().mean() > 0.9
 
 
 @pytest.mark.parametrize("kind", ["noise", "demos"])

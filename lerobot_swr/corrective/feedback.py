@@ -28,8 +28,10 @@ class Feedback:
         self.actions = torch.from_numpy(trajectories.columns[ACTION])
         self.gain = torch.from_numpy(model.gain.astype(np.float32))  # (A, d)
         self.targets = torch.from_numpy(model.targets)
+        self._has_targets = bool((self.targets >= 0).any())
         demonstrated = relative_to_state(self.actions, self.paths.states, self.targets)
-        self.limits = demonstrated.abs().amax(dim=0)  # (A,)
+        # (A,); above 0, so that an action dimension that is never used is limited to (almost) nothing
+        self.limits = demonstrated.abs().amax(dim=0).clamp(min=torch.finfo(torch.float32).tiny)
 
     def to(self, device: torch.device) -> None:
         """Move everything to a device; nothing happens if it is there."""
@@ -41,10 +43,12 @@ class Feedback:
     def act(self, states: Tensor, matched: Tensor) -> Tensor:
         """(B, A) actions in raw units for states (B, d) whose matched frames are the (B,) rows `matched`."""
         corrected = self.actions[matched] + (states - self.paths.states[matched]) @ self.gain.T
-        base = corrected - relative_to_state(corrected, states, self.targets)  # (B, A), 0 for displacements
-        return base + self.limit(corrected - base)
+        if not self._has_targets:
+            return self.limit(corrected)
+        relative = relative_to_state(corrected, states, self.targets)
+        return corrected - relative + self.limit(relative)
 
     def limit(self, actions: Tensor) -> Tensor:
         """Scale each of the (B, A) actions, relative where they are targets, into the symmetric range."""
-        excess = (actions.abs() / self.limits.clamp(min=torch.finfo(torch.float32).tiny)).amax(dim=1)
+        excess = (actions.abs() / self.limits).amax(dim=1)
         return actions / excess.clamp(min=1)[:, None]

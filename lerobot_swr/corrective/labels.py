@@ -93,7 +93,7 @@ class CorrectiveLabels:
             places = places[:0]
         parts = [
             self._states(rows[some], uniforms[some, 1:], candidates)
-            for some in places.split(CHUNK) or [places]
+            for some in (places.split(CHUNK) if len(places) > CHUNK else [places])
         ]
         states, matched = (torch.cat(part) for part in zip(*parts, strict=True))
         observations = {key: column[matched] for key, column in self._others.items()}

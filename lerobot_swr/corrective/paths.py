@@ -21,6 +21,13 @@ class DemonstratedPaths:
     A distance is the root mean square over the state's dimensions, each in units of its range; dimensions
     that never change do not count.
 
+    Attributes:
+        states: (F, d), raw.
+        range: (d,) of each dimension.
+        episode: (F,) episode of each frame.
+        phase: (F,) progress of each frame in its episode, 0 to 1.
+        window: How far from where it is expected a frame is looked for, in frames.
+
     Args:
         states: (F, d) float32, episodes one after the other, in raw units.
         lengths: (N,) frames per episode.
@@ -36,6 +43,12 @@ class DemonstratedPaths:
         self.lengths = torch.from_numpy(lengths)
         self.starts = self.lengths.cumsum(0) - self.lengths
         self.episode = torch.arange(len(lengths)).repeat_interleave(self.lengths)  # (F,)
+        self.last = (self.starts + self.lengths - 1)[self.episode]  # (F,) last frame of a frame's episode
+        progress = torch.arange(len(states)) - self.starts[self.episode]
+        self.phase = progress / (self.lengths[self.episode] - 1).clamp(min=1)  # (F,) from 0 to 1
+        share = torch.linspace(0, 1, GRID)
+        grid = self.starts[:, None] + (share * (self.lengths[:, None] - 1)).round().long()
+        self._grid = grid  # (N, GRID) rows evenly spread over every episode
         self.window = max(1, round(WINDOW * float(lengths.mean())))
         future = torch.linspace(0, LOOKAHEAD * float(lengths.mean()), FUTURE)
         self._future = future.round().long()
@@ -46,11 +59,6 @@ class DemonstratedPaths:
             for name, value in vars(self).items():
                 if isinstance(value, Tensor):
                     setattr(self, name, value.to(device))
-
-    def phase(self, rows: Tensor) -> Tensor:
-        """Progress of frames in their episodes, 0 to 1."""
-        episode = self.episode[rows]
-        return (rows - self.starts[episode]) / (self.lengths[episode] - 1).clamp(min=1)
 
     def nearest(self, states: Tensor, around: Tensor) -> Tensor:
         """The frame of a demonstration that is nearest to a state, near a frame where it is expected.
@@ -108,22 +116,16 @@ class DemonstratedPaths:
         partners = candidates[place]  # (B, C)
         progress = uniforms[:, CANDIDATES : 2 * CANDIDATES] * self.lengths[partners]
         rows = self.starts[partners] + torch.minimum(progress.long(), self.lengths[partners] - 1)
-        grid = self._grid(episodes)  # (B, GRID)
+        grid = self._grid[episodes]  # (B, GRID)
         cumulative = (-self._costs(rows, grid) / bandwidth).softmax(dim=1).double().cumsum(dim=1)
         threshold = uniforms[:, -1:].double() * cumulative[:, -1:]
         chosen = torch.searchsorted(cumulative, threshold, right=True).clamp(max=CANDIDATES - 1)
         partner = rows.gather(1, chosen).squeeze(1)
         return partner, self._expected(partner, grid)
 
-    def _grid(self, episodes: Tensor) -> Tensor:
-        """(B, GRID) rows evenly spread over the (B,) episodes."""
-        share = torch.linspace(0, 1, GRID, device=episodes.device)
-        return self.starts[episodes][:, None] + (share * (self.lengths[episodes] - 1)[:, None]).round().long()
-
     def _costs(self, rows: Tensor, grid: Tensor) -> Tensor:
         """(B, C) mean distance of the next frames of (B, C) rows to the nearest of (B, GRID) rows."""
-        last = (self.starts + self.lengths - 1)[self.episode[rows]]
-        ahead = torch.minimum(rows[..., None] + self._future, last[..., None])  # (B, C, FUTURE)
+        ahead = torch.minimum(rows[..., None] + self._future, self.last[rows][..., None])  # (B, C, FUTURE)
         x, y = self._scaled[ahead.flatten(1)], self._scaled[grid]
         # |y|² − 2 x·y, to which |x|² is added after the minimum; float32 is exact enough for a coarse cost.
         squared = torch.baddbmm(y.square().sum(dim=-1)[:, None], x, y.transpose(1, 2), alpha=-2).amin(dim=-1)
@@ -136,6 +138,6 @@ class DemonstratedPaths:
         The nearest one that has progressed alike: a path that passes a place twice is not mixed up.
         """
         squared = (self._scaled[rows][:, None] - self._scaled[grid]).square().sum(dim=-1)
-        apart = (self.phase(rows)[:, None] - self.phase(grid)).abs() > PHASE_WINDOW
+        apart = (self.phase[rows][:, None] - self.phase[grid]).abs() > PHASE_WINDOW
         place = squared.masked_fill(apart, torch.inf).argmin(dim=1, keepdim=True)
         return grid.gather(1, place).squeeze(1)
