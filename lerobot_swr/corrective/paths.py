@@ -47,8 +47,8 @@ class DemonstratedPaths:
         progress = torch.arange(len(states)) - self.starts[self.episode]
         self.phase = progress / (self.lengths[self.episode] - 1).clamp(min=1)  # (F,) from 0 to 1
         share = torch.linspace(0, 1, GRID)
-        grid = self.starts[:, None] + (share * (self.lengths[:, None] - 1)).round().long()
-        self._grid = grid  # (N, GRID) rows evenly spread over every episode
+        # (N, GRID) rows evenly spread over every episode
+        self._grid = self.starts[:, None] + (share * (self.lengths[:, None] - 1)).round().long()
         self.window = max(1, round(WINDOW * float(lengths.mean())))
         future = torch.linspace(0, LOOKAHEAD * float(lengths.mean()), FUTURE)
         self._future = future.round().long()
