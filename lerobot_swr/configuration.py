@@ -1,8 +1,10 @@
-"""How configurations of this package refuse bad values under LeRobot's parser."""
+"""How configurations of this package meet LeRobot's parser: refusing bad values, telling a resumed run."""
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -41,3 +43,22 @@ def check_dataset_folder() -> None:
             f"dataset.root={root!r}: no such folder, and HF_HUB_OFFLINE is set, so it cannot be downloaded; "
             "check the path, or make the dataset (lerobot-swr-dataset)"
         )
+
+
+_resuming: ContextVar[bool | None] = ContextVar("resuming", default=None)
+
+
+def is_resuming() -> bool:
+    """Whether the policy that is being made continues a run, rather than starting one from a checkpoint."""
+    told = _resuming.get()
+    return parser.parse_arg("resume") in ("true", "True", "yes", "1") if told is None else told
+
+
+@contextmanager
+def resuming(value: bool) -> Iterator[None]:
+    """Say within the block what `is_resuming` would otherwise read from the command line."""
+    token = _resuming.set(value)
+    try:
+        yield
+    finally:
+        _resuming.reset(token)

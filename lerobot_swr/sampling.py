@@ -68,7 +68,10 @@ class SimilarityWeightedSampler:
         self.normalization, self.partner_sampling = normalization, partner_sampling
         self._distances = distances
         self._candidates = b""  # what `set_candidates` was given; equal bytes are the quickest comparison
-        self._largest = np.zeros(len(distances))  # (N,) largest distance to a candidate
+        self._marked = np.zeros(len(distances), dtype=bool)
+        self._candidate_list = np.flatnonzero(self._marked)
+        self._row_largest = np.zeros(len(distances))  # (N,) largest distance to a candidate
+        self._largest = self._row_largest  # (N,) what a row of distances is divided by
         self._effective_demos: float | None = None
 
     def set_candidates(self, candidates: Tensor) -> None:
@@ -77,12 +80,17 @@ class SimilarityWeightedSampler:
         content = given.tobytes()
         if content == self._candidates:
             return
-        self._candidates, marked = content, given != 0
+        known, marked = self._marked, given != 0
+        self._candidates, self._marked = content, marked
         self._candidate_list = np.flatnonzero(marked)  # (M,)
         self._place = marked.cumsum() - 1  # (N,) place of a candidate in that list
-        self._largest = self._distances[:, self._candidate_list].max(axis=1)
+        if (known & ~marked).any():
+            known, self._row_largest = np.zeros_like(known), np.zeros(len(known))
+        joined = np.flatnonzero(marked & ~known)  # few at a time, while episodes are seen for the first time
+        self._row_largest = np.maximum(self._row_largest, self._distances[:, joined].max(axis=1, initial=0))
+        self._largest = self._row_largest
         if self.normalization == "global":
-            self._largest = np.full(len(marked), self._largest[self._candidate_list].max())
+            self._largest = np.full(len(marked), self._row_largest[self._candidate_list].max())
         # Shares of the pairs, cumulative over partners: rows are filled when they are needed.
         self._shares = np.empty((len(marked), len(self._candidate_list)))  # (N, M)
         self._has_shares = np.zeros(len(marked), dtype=bool)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -10,13 +11,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import make_batch, train_flags
+from conftest import SMALL_MAZE, make_batch, train_flags
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file
 
 from lerobot_swr.cli import train as train_command
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.stacked_policies import StackedPolicies
 
@@ -30,7 +33,8 @@ def weights(run: Path, step: int) -> dict[str, torch.Tensor]:
 
 def assert_same_files(one: Path, other: Path) -> None:
     """Weights and the whole training state of two checkpoints are equal, bit for bit."""
-    for name in ("pretrained_model/model.safetensors", "training_state/optimizer_state.safetensors"):
+    tensors = ("optimizer_state.safetensors", "rng_state.safetensors")
+    for name in ("pretrained_model/model.safetensors", *(f"training_state/{file}" for file in tensors)):
         expected, found = load_file(one / name), load_file(other / name)
         assert expected.keys() == found.keys()
         for key, value in expected.items():
@@ -137,9 +141,10 @@ def test_a_seed_trained_alone_equals_that_seed_among_others(swr_train, small_maz
     )
 
 
-def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path):
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path, jobs):
     """kill -9 in the middle, then --resume=true: every seed ends as in an uninterrupted run."""
-    flags = [*SMALL, "--save_freq=20", "--seeds=0,1,2", "--jobs=1"]
+    flags = [*SMALL, "--save_freq=20", "--seeds=0,1,2", f"--jobs={jobs}"]
     steps = 400
     swr_train(*train_flags("wzbc", small_maze, tmp_path / "whole", steps, *flags))
     killed = train_flags("wzbc", small_maze, tmp_path / "killed", steps, *flags)
@@ -154,8 +159,12 @@ def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp
     while not begun.is_dir():
         assert process.poll() is None
         time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
     process.send_signal(signal.SIGKILL)
     process.wait()
+    for child in children:
+        while Path(f"/proc/{child}").is_dir():  # ends by itself, or the test's time limit tells
+            time.sleep(0.05)
     assert not (tmp_path / "killed" / "seed_2" / "checkpoints" / f"{steps:06d}").is_dir()
     swr_train(*killed, "--resume=true")
     for seed in range(3):
@@ -204,6 +213,8 @@ def test_episodes_that_are_left_out_get_no_style(swr_train, small_maze, tmp_path
         (("--policy.type=act",), "policy.type='act': this command trains bc, zbc and wzbc"),
         (("--dataset.eval_split=0.2", "--eval_steps=5"), "eval_steps: not available"),
         (("--jobs=0",), "jobs=0"),
+        (("--seed=7",), "seed=7: this command takes --seeds=7"),
+        (("--save_checkpoint=false",), "save_checkpoint=false: not available"),
     ],
 )
 def test_the_impossible_is_refused_before_training(swr_train, small_maze, tmp_path, capfd, flags, message):
@@ -226,3 +237,81 @@ def test_an_existing_folder_and_changed_options_are_refused(swr_train, small_maz
     with pytest.raises(SystemExit):
         swr_train(*flags, "--resume=true", "--policy.style_dim=4")
     assert "other values of policy" in capfd.readouterr().err
+
+
+def test_a_fine_tuned_run_resumes_and_each_seed_draws_its_own_pairs(swr_train, small_maze, tmp_path):
+    """From another dataset's checkpoint: interrupted and resumed to the same weights, a seed added later."""
+    write_dataset(_recipe("other", "small", {"10": 2, "20": 2}, steady), tmp_path / "other", seed=9)
+    swr_train(
+        *train_flags("wzbc", tmp_path / "other", tmp_path / "base", 12, *SMALL, "--seeds=0", "--jobs=1")
+    )
+    base = tmp_path / "base/seed_0/checkpoints/last/pretrained_model"
+    flags = [
+        flag for flag in train_flags("wzbc", small_maze, tmp_path / "run", 20) if "policy.type" not in flag
+    ]
+    flags = [f"--policy.path={base}", *flags, "--save_freq=10", "--seeds=1,2", "--jobs=1"]
+    swr_train(*flags)
+    expected = {seed: weights(tmp_path / "run" / f"seed_{seed}", 20) for seed in (1, 2)}
+    for seed in (1, 2):
+        assert int(expected[seed]["draws.seed"]) == seed
+        assert len(expected[seed]["styles.embedding.weight"]) == 6
+    shutil.rmtree(tmp_path / "run/seed_2/checkpoints/000020")
+    swr_train(*flags[:-2], "--seeds=1,2,3", "--jobs=1", "--resume=true")
+    for name, value in weights(tmp_path / "run/seed_2", 20).items():
+        assert torch.equal(value, expected[2][name]), name
+    assert int(weights(tmp_path / "run/seed_3", 20)["draws.seed"]) == 3
+
+
+def test_resuming_on_a_changed_dataset_is_refused(swr_train, small_maze, tmp_path, capfd):
+    """The same folder with other demonstrations: an error, not another training."""
+    root = tmp_path / "data"
+    shutil.copytree(small_maze, root)
+    flags = [
+        *train_flags("zbc", root, tmp_path / "run", 20, *SMALL),
+        "--save_freq=10",
+        "--seeds=0",
+        "--jobs=1",
+    ]
+    swr_train(*flags)
+    shutil.rmtree(tmp_path / "run/seed_0/checkpoints/000020")
+    write_dataset(_recipe("small_maze", "small", SMALL_MAZE, steady), root, seed=5, overwrite=True)
+    with pytest.raises(SystemExit):
+        swr_train(*flags, "--resume=true")
+    assert "is not the dataset of the checkpoint" in capfd.readouterr().err
+
+
+def test_a_command_that_failed_at_its_start_can_be_corrected(swr_train, small_maze, tmp_path, capfd):
+    """No checkpoint was written, so other options are welcome in the same folder."""
+    flags = train_flags("wzbc", small_maze, tmp_path / "run", 4, *SMALL, "--seeds=0", "--jobs=1")
+    with pytest.raises(SystemExit):
+        swr_train(*flags, '--policy.similarity_keys=["observation.speed"]')
+    assert "observation.speed" in capfd.readouterr().err
+    swr_train(*flags)
+    assert weights(tmp_path / "run/seed_0", 4)
+
+
+def test_the_last_link_is_mended(swr_train, small_maze, tmp_path):
+    """A kill between a checkpoint and its link: the next command points to the last checkpoint again."""
+    flags = [
+        *train_flags("zbc", small_maze, tmp_path / "run", 6, *SMALL),
+        "--save_freq=3",
+        "--seeds=0",
+        "--jobs=1",
+    ]
+    swr_train(*flags)
+    link = tmp_path / "run/seed_0/checkpoints/last"
+    link.unlink()
+    link.symlink_to("000003")
+    swr_train(*flags, "--resume=true")
+    assert link.resolve().name == "000006"
+
+
+def test_seeds_are_read_in_every_form():
+    """With an equals sign or a space, with brackets or without."""
+    forms = (["--seeds=0,1"], ["--seeds", "0,1"], ["--seeds=[0,1]"])
+    for form in forms:
+        assert list(train_command._with_brackets(["x", *form, "--steps=3"])) == [
+            "x",
+            "--seeds=[0,1]",
+            "--steps=3",
+        ]

@@ -9,6 +9,7 @@ Examples:
 
 import re
 import sys
+from collections.abc import Iterator
 
 from lerobot.configs import parser
 from lerobot.utils.import_utils import register_third_party_plugins
@@ -31,6 +32,16 @@ def main() -> None:
     """Entry point."""
     init_logging()
     register_third_party_plugins()
-    # `--seeds=0,1,2` as a list, which LeRobot's parser wants in brackets
-    sys.argv = [re.sub(r"^--seeds=(\d+(,\d+)*)$", r"--seeds=[\1]", flag) for flag in sys.argv]
+    if parser.parse_arg("seed") is not None:
+        raise ValueError(
+            f"seed={parser.parse_arg('seed')}: this command takes --seeds={parser.parse_arg('seed')}"
+        )
+    sys.argv = list(_with_brackets(sys.argv))
     train()
+
+
+def _with_brackets(arguments: list[str]) -> Iterator[str]:
+    """``--seeds=0,1,2`` or ``--seeds 0,1,2`` as ``--seeds=[0,1,2]``, which LeRobot's parser understands."""
+    joined = re.sub(r"(^|\n)--seeds\n(?=\d)", r"\1--seeds=", "\n".join(arguments))
+    for argument in joined.split("\n"):
+        yield re.sub(r"^--seeds=(\d+(,\d+)*)$", r"--seeds=[\1]", argument)

@@ -121,20 +121,10 @@ class Corrections(nn.Module):
         """(B, A) actions of the network's outputs for a batch of observations."""
         return outputs if self.relative is None else self.relative.decode(outputs, batch[OBS_STATE])
 
-    def translate_checkpoint(
-        self, state: dict[str, Tensor], prefix: str, has_dataset: bool
-    ) -> dict[str, Tensor]:
-        """A policy's checkpoint with what it may lack: one trained without corrective labels has no draws.
-
-        Args:
-            state: The checkpoint.
-            prefix: Of this module's tensors.
-            has_dataset: Whether relative actions were standardised by a dataset, which then holds.
-        """
-        own = {prefix + key: value for key, value in self.state_dict().items()}
-        draws = {key: value for key, value in own.items() if key.startswith(f"{prefix}draws.")}
-        fitted = own.keys() - draws.keys() if has_dataset else ()
-        return {**draws, **state, **{key: own[key] for key in fitted}}
+    def fitted(self, prefix: str) -> dict[str, Tensor]:
+        """What was computed from the training dataset and therefore holds against a checkpoint's, by name."""
+        own = {key: value for key, value in self.state_dict().items() if not key.startswith("draws.")}
+        return {prefix + key: value for key, value in own.items()}
 
     def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
         """``corrective_loss``: the mean loss of corrective frames, unbiased; read its average over time."""

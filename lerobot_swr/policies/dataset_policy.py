@@ -4,13 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lerobot.configs import parser
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
 
+from lerobot_swr.configuration import is_resuming
 from lerobot_swr.policies.configuration_swr import BCConfig
-from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors, with_unit_std_where_constant
 from lerobot_swr.policies.state_policy import StatePolicy
+from lerobot_swr.sampling import StepGenerator
 from lerobot_swr.style_encoding import Frames
 from lerobot_swr.style_table import OUTCOMES
 from lerobot_swr.trajectories import Trajectories, load_trajectories
@@ -46,10 +48,12 @@ class DatasetPolicy(StatePolicy):
         outcomes = [key for key in OUTCOMES if key in meta.features]
         self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION, *outcomes])
         self._dataset_meta = meta
+        # LeRobot's own fine-tuning would hand the raw statistics to the processors.
+        meta.stats = with_unit_std_where_constant(config, meta.stats)
         fingerprint = self._trajectories.fingerprint([OBS_STATE])
         known = config.dataset_fingerprint
         self._new_dataset = known is not None and known != fingerprint
-        if self._new_dataset and parser.parse_arg("resume") in ("true", "True", "yes", "1"):
+        if self._new_dataset and is_resuming():
             raise ValueError(
                 f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
                 f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
@@ -87,3 +91,14 @@ class DatasetPolicy(StatePolicy):
         _ = self.trajectories
         assert self._dataset_meta is not None
         return Path(self._dataset_meta.root)
+
+    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """A run that starts from a checkpoint draws the numbers of its own seed; one that resumes goes on."""
+        own = {
+            f"{name}.{key}": value
+            for name, module in self.named_modules()
+            if isinstance(module, StepGenerator)
+            for key, value in module.state_dict().items()
+        }
+        starts = self._dataset_meta is not None and not is_resuming()
+        return {**state, **own} if starts else {**own, **state}

@@ -342,8 +342,9 @@ class ZBCPolicy(BCPolicy):
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """On another dataset keep the network and start new styles."""
-        if self.corrections is not None:
-            state = self.corrections.translate_checkpoint(state, "corrections.", self._dynamics is not None)
+        state = super()._translate_checkpoint(state)
+        if self.corrections is not None and self._dynamics is not None:
+            state = {**state, **self.corrections.fitted("corrections.")}
         if not self._new_dataset:
             return state
         logger.warning(
@@ -387,11 +388,6 @@ class WZBCPolicy(ZBCPolicy):
                 config.similarity_normalization,  # type: ignore[arg-type]
                 config.partner_sampling,  # type: ignore[arg-type]
             )
-
-    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Checkpoints from before the draws' seed was kept start a new sequence of draws."""
-        draws = {f"draws.{key}": value for key, value in self.draws.state_dict().items()}
-        return {**draws, **super()._translate_checkpoint(state)}
 
     def compared_keys(self) -> Sequence[str]:
         """The features over which ν compares demonstrations.

@@ -17,14 +17,14 @@ Statistics = dict[str, dict[str, Any]]
 
 def make_bc_pre_post_processors(config: StateConfig, dataset_stats: Statistics | None = None) -> Pipelines:
     """LeRobot's default pipelines; constant dimensions are centred instead of being blown up."""
-    return make_default_pre_post_processors(config, _with_unit_std_where_constant(config, dataset_stats))
+    return make_default_pre_post_processors(config, with_unit_std_where_constant(config, dataset_stats))
 
 
 make_zbc_pre_post_processors = make_bc_pre_post_processors
 make_wzbc_pre_post_processors = make_bc_pre_post_processors
 
 
-def _with_unit_std_where_constant(config: StateConfig, stats: Statistics | None) -> Statistics | None:
+def with_unit_std_where_constant(config: StateConfig, stats: Statistics | None) -> Statistics | None:
     """Set the standard deviation of constant dimensions to 1.
 
     LeRobot divides by std + 1e-8, so the rounding error of a constant's mean would become an input or a

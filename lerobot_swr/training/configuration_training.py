@@ -3,6 +3,7 @@
 import copy
 import os
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import draccus
@@ -10,7 +11,11 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_swr.policies.configuration_swr import BCConfig
 
-DECISIVE = ("dataset", "policy", "batch_size", "steps", "optimizer", "scheduler", "rename_map")
+OPTIONS_FILE = "seeds_train_config.json"
+DECISIVE = (
+    *("dataset", "policy", "batch_size", "steps"),
+    *("optimizer", "scheduler", "use_policy_training_preset"),
+)
 
 
 @dataclass
@@ -36,7 +41,7 @@ class SeedsTrainConfig(TrainPipelineConfig):
         for key in filled if self.output_dir else [*filled, "output_dir"]:
             setattr(self, key, getattr(new_run, key))
         assert self.output_dir is not None
-        if not self.resume and self.output_dir.is_dir():
+        if not self.resume and self.output_dir.is_dir() and not _is_untouched(self.output_dir):
             raise FileExistsError(
                 f"output_dir={str(self.output_dir)!r} exists; go on with its runs with --resume=true, or "
                 "choose another folder"
@@ -44,7 +49,8 @@ class SeedsTrainConfig(TrainPipelineConfig):
         if not self.seeds or len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
             raise ValueError(f"seeds={self.seeds}: expected different numbers >= 0, e.g. --seeds=0,1,2,3,4")
         if self.jobs is None:
-            self.jobs = os.cpu_count() or 1
+            on_cpu = self.policy is not None and self.policy.device == "cpu"
+            self.jobs = len(os.sched_getaffinity(0)) if on_cpu and hasattr(os, "sched_getaffinity") else 1
         for key in ("jobs", "steps", "batch_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
@@ -64,6 +70,9 @@ class SeedsTrainConfig(TrainPipelineConfig):
             "peft": self.peft is not None,
             "sample_weighting": self.sample_weighting is not None,
             "job": self.job.is_remote,
+            "rename_map": bool(self.rename_map),
+            "policy.use_amp": self.policy.use_amp,
+            "save_checkpoint=false": not self.save_checkpoint,
         }
         given = [key for key, is_given in refused.items() if is_given]
         if given:
@@ -83,4 +92,17 @@ class SeedsTrainConfig(TrainPipelineConfig):
 
     def decisive_options(self) -> dict[str, Any]:
         """The options that the trained weights depend on, encoded."""
-        return {key: draccus.encode(getattr(self, key)) for key in DECISIVE}
+        options = {key: draccus.encode(getattr(self, key)) for key in DECISIVE}
+        # Where the dataset lies does not matter; its content does, and a resumed policy checks that.
+        options["dataset"].pop("root")
+        return options
+
+
+def is_begun(output_dir: Path) -> bool:
+    """Whether an output folder holds a checkpoint."""
+    return any(output_dir.glob("seed_*/checkpoints/*"))
+
+
+def _is_untouched(output_dir: Path) -> bool:
+    """Whether a folder holds nothing but the options of a command that failed at its start."""
+    return not is_begun(output_dir) and {path.name for path in output_dir.iterdir()} <= {OPTIONS_FILE}

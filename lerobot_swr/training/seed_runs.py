@@ -1,44 +1,50 @@
 """The runs of several seeds on disk: one ordinary LeRobot run per seed."""
 
 import json
-import logging
 import os
 import shutil
 from pathlib import Path
 
-import torch
+from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.common.train_utils import (
     get_step_checkpoint_dir,
     load_training_state,
     save_checkpoint,
-    update_last_checkpoint,
 )
+from lerobot.configs import PreTrainedConfig
 from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.processor import PolicyProcessorPipeline
-from lerobot.utils.constants import CHECKPOINTS_DIR, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import (
+    CHECKPOINTS_DIR,
+    LAST_CHECKPOINT_LINK,
+    OPTIMIZER_STATE,
+    PRETRAINED_MODEL_DIR,
+    RNG_STATE,
+    TRAINING_STATE_DIR,
+    TRAINING_STEP,
+)
 from lerobot.utils.random_utils import set_seed
 
+from lerobot_swr.configuration import resuming
 from lerobot_swr.policies.modeling_swr import BCPolicy
-from lerobot_swr.training.configuration_training import SeedsTrainConfig
+from lerobot_swr.training.configuration_training import OPTIONS_FILE, SeedsTrainConfig, is_begun
 from lerobot_swr.training.stacked_policies import StackedPolicies
-
-OPTIONS_FILE = "seeds_train_config.json"
-
-logger = logging.getLogger(__name__)
 
 
 def check_options(config: SeedsTrainConfig) -> None:
     """Remember the options in the output folder; refuse to go on there with others.
+
+    Options of a command that has not written a checkpoint yet are forgotten.
 
     Raises:
         ValueError: Naming the options in which the interrupted command differs from this one.
     """
     assert config.output_dir is not None
     file, options = config.output_dir / OPTIONS_FILE, json.loads(json.dumps(config.decisive_options()))
-    if file.is_file():
+    if file.is_file() and is_begun(config.output_dir):
         known = json.loads(file.read_text())
         changed = sorted(key for key in options if options[key] != known.get(key))
         if changed:
@@ -58,7 +64,33 @@ def last_step(run: TrainPipelineConfig) -> int:
     assert run.output_dir is not None
     folder = run.output_dir / CHECKPOINTS_DIR
     steps = [int(path.name) for path in folder.iterdir() if path.name.isdigit()] if folder.is_dir() else []
-    return max(steps, default=0)
+    return max((step for step in steps if _is_complete(checkpoint_folder(run, step))), default=0)
+
+
+def checkpoint_folder(run: TrainPipelineConfig, step: int) -> Path:
+    """Folder of a run's checkpoint."""
+    assert run.output_dir is not None
+    return get_step_checkpoint_dir(run.output_dir, run.steps, step)
+
+
+def _is_complete(checkpoint: Path) -> bool:
+    """Whether everything is there that resuming needs (LeRobot's own command writes in place)."""
+    state = checkpoint / TRAINING_STATE_DIR
+    needed = [state / OPTIMIZER_STATE, state / RNG_STATE, state / TRAINING_STEP]
+    return all(
+        file.is_file() for file in [checkpoint / PRETRAINED_MODEL_DIR / SAFETENSORS_SINGLE_FILE, *needed]
+    )
+
+
+def point_to_last(run: TrainPipelineConfig) -> Path:
+    """Let ``checkpoints/last`` name the last complete checkpoint; returns its policy's folder."""
+    folder = checkpoint_folder(run, last_step(run))
+    link = folder.parent / LAST_CHECKPOINT_LINK
+    temporary = link.with_name(f".{link.name}.{os.getpid()}")
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(folder.name)
+    os.replace(temporary, link)
+    return link / PRETRAINED_MODEL_DIR
 
 
 class SeedRuns:
@@ -85,7 +117,7 @@ class SeedRuns:
             policy = self._make_policy(run, meta)
             optimizer, schedule = make_optimizer_and_scheduler(run, policy)
             if self.step:
-                load_training_state(self._checkpoint(run, self.step), optimizer, schedule)
+                load_training_state(checkpoint_folder(run, self.step), optimizer, schedule)
             self.policies.append(policy.train())
             optimizers.append(optimizer)
             scheduler = scheduler or schedule
@@ -93,12 +125,15 @@ class SeedRuns:
         self.stack = StackedPolicies(self.policies, optimizers, scheduler, self.runs[0])
 
     def _make_policy(self, run: TrainPipelineConfig, meta: LeRobotDatasetMetadata) -> BCPolicy:
-        assert run.policy is not None
         assert run.seed is not None
         if self.step:
-            run.policy.pretrained_path = self._checkpoint(run, self.step) / PRETRAINED_MODEL_DIR
+            path = checkpoint_folder(run, self.step) / PRETRAINED_MODEL_DIR
+            run.policy = PreTrainedConfig.from_pretrained(path)
+            run.policy.pretrained_path = path
+        assert run.policy is not None
         set_seed(run.seed)  # as lerobot-train does, so that the policy starts from the same weights
-        policy = make_policy(run.policy, ds_meta=meta, rename_map=run.rename_map)
+        with resuming(bool(self.step)):
+            policy = make_policy(run.policy, ds_meta=meta)
         assert isinstance(policy, BCPolicy)
         return policy
 
@@ -120,26 +155,20 @@ class SeedRuns:
             preprocessor_overrides={
                 "device_processor": {"device": str(policy.config.device)},
                 "normalizer_processor": {**inputs, "stats": meta.stats},
-                "rename_observations_processor": {"rename_map": run.rename_map},
             },
             postprocessor_overrides={"unnormalizer_processor": {**outputs, "stats": meta.stats}},
         )
-
-    @staticmethod
-    def _checkpoint(run: TrainPipelineConfig, step: int) -> Path:
-        assert run.output_dir is not None
-        return get_step_checkpoint_dir(run.output_dir, run.steps, step)
 
     def save(self) -> None:
         """Write a checkpoint of every run; one that is under way when the process ends leaves nothing."""
         self.stack.unstack()
         for k, (run, policy) in enumerate(zip(self.runs, self.policies, strict=True)):
-            folder = self._checkpoint(run, self.step)
+            folder = checkpoint_folder(run, self.step)
             unfinished = folder.with_name(f".{folder.name}.unfinished")
             shutil.rmtree(unfinished, ignore_errors=True)
             assert run.seed is not None
             # Training draws nothing from the global generator; a run that goes on from here finds it seeded.
-            torch.manual_seed(run.seed)
+            set_seed(run.seed)
             save_checkpoint(
                 unfinished,
                 self.step,
@@ -153,5 +182,7 @@ class SeedRuns:
                 batch_size=run.batch_size,
                 optim_state_dict=self.stack.optimizer_state(k),
             )
+            if folder.exists():  # incomplete
+                shutil.rmtree(folder)
             os.replace(unfinished, folder)
-            update_last_checkpoint(folder)
+            point_to_last(run)

@@ -2,11 +2,12 @@
 
 import ctypes
 import logging
+import math
 import multiprocessing
 import os
+import sys
 import time
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -14,21 +15,20 @@ from typing import Any
 import torch
 from lerobot.common.train_utils import should_save_checkpoint
 from lerobot.datasets.factory import make_train_eval_datasets
-from lerobot.utils.constants import ACTION, CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
+from lerobot.utils.constants import ACTION
 from lerobot.utils.utils import init_logging
 from torch import Tensor
 from tqdm import tqdm
 
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
-from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step
+from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step, point_to_last
 
 STEPS_AT_ONCE = 64  # whose frames and pairs are drawn together
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 logger = logging.getLogger(__name__)
-_progress: Any = None  # per group of seeds the steps done, shared between processes
 
 
 def train_seeds(config: SeedsTrainConfig) -> list[Path]:
@@ -44,19 +44,20 @@ def train_seeds(config: SeedsTrainConfig) -> list[Path]:
         The folder of each seed's trained policy.
 
     Raises:
-        ValueError: If the output folder was begun with other options.
+        ValueError: If the output folder was begun with other options or another dataset, or a loss is not
+            finite.
+        ChildProcessError: If one of several processes failed; it has said why.
     """
     check_options(config)
-    steps = {seed: last_step(config.of_seed(seed)) for seed in config.seeds}
+    runs = {seed: config.of_seed(seed) for seed in config.seeds}
+    steps = {seed: last_step(run) for seed, run in runs.items()}
     waiting = [seed for seed in config.seeds if steps[seed] < config.steps]
     groups = list(_spread(waiting, steps, config.jobs or 1))
     if len(groups) == 1:
-        _train_group(config, groups[0], 0, None)
+        _train_group(config, groups[0])
     elif groups:
         _train_in_processes(config, groups, steps)
-    assert config.output_dir is not None
-    last = Path(CHECKPOINTS_DIR) / LAST_CHECKPOINT_LINK / PRETRAINED_MODEL_DIR
-    return [config.output_dir / f"seed_{seed}" / last for seed in config.seeds]
+    return [point_to_last(run) for run in runs.values()]
 
 
 def _spread(seeds: list[int], steps: dict[int, int], jobs: int) -> Iterator[list[int]]:
@@ -70,43 +71,62 @@ def _spread(seeds: list[int], steps: dict[int, int], jobs: int) -> Iterator[list
 
 def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps: dict[int, int]) -> None:
     context = multiprocessing.get_context("spawn")
-    progress = context.Array("q", len(groups), lock=False)
-    jobs = config.jobs or 1
-    total = sum(config.steps - steps[seed] for group in groups for seed in group)
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=_start, initargs=(progress,))
-    with pool, tqdm(total=total, desc="Training", unit="seed-step") as bar:
-        futures = [pool.submit(_train_group, config, g, i, os.getpid()) for i, g in enumerate(groups)]
-        while not all(future.done() for future in futures):
-            time.sleep(0.2)
-            bar.update(sum(progress) - bar.n)
-            failed = [f for f in futures if f.done() and f.exception() is not None]
-            if failed:
-                pool.shutdown(wait=False, cancel_futures=True)
-                failed[0].result()
-        bar.update(sum(progress) - bar.n)
+    done = context.Array("q", len(groups), lock=False)
+    waiting = [
+        (seeds, context.Process(target=_process, args=(config, seeds, done, i, os.getpid()), daemon=True))
+        for i, seeds in enumerate(groups)
+    ]
+    running: list[tuple[list[int], Any]] = []
+    total = sum(config.steps - steps[seed] for seeds in groups for seed in seeds)
+    with tqdm(total=total, desc="Training", unit="seed-step") as bar:
+        try:
+            while waiting or running:
+                while waiting and len(running) < (config.jobs or 1):
+                    running.append(waiting.pop(0))
+                    running[-1][1].start()
+                time.sleep(0.2)
+                bar.update(sum(done) - bar.n)
+                for seeds, process in running:
+                    if process.exitcode:
+                        raise ChildProcessError(
+                            f"the process that trains seeds {seeds} ended with status {process.exitcode}; "
+                            "what it said is above. Checkpoints are kept: go on with --resume=true "
+                            "(--jobs=1 if memory was short)"
+                        )
+                running = [(seeds, process) for seeds, process in running if process.exitcode is None]
+        finally:
+            for _, process in running:
+                process.terminate()
 
 
-def _start(progress: Any) -> None:
-    """Prepare a process."""
-    global _progress
-    _progress = progress
+def _process(config: SeedsTrainConfig, seeds: list[int], done: Any, group: int, parent: int) -> None:
+    """What a process does: train a group of seeds, counting into ``done[group]``; end with its parent."""
+
+    def count() -> None:
+        if os.getppid() != parent:
+            os._exit(1)
+        done[group] += len(seeds)
+
     init_logging()
+    try:
+        _train_group(config, seeds, count)
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
-def _train_group(config: SeedsTrainConfig, seeds: list[int], group: int, parent: int | None) -> None:
+def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[], None] | None = None) -> None:
     """Train seeds that stand at the same step to the end, in this process.
 
     Args:
         config: The command's configuration.
         seeds: K seeds.
-        group: Place of the group in the shared progress.
-        parent: The process to end with; None shows a progress bar of its own.
+        count: Called after each step; None shows a progress bar instead.
     """
     # Threads would gain nothing on networks of this size, and their number would change the rounding.
     torch.set_num_threads(1)
     _keep_freed_memory()
-    first = config.of_seed(seeds[0])
-    dataset, _ = make_train_eval_datasets(first)
+    dataset, _ = make_train_eval_datasets(config.of_seed(seeds[0]))
     runs = SeedRuns(config, seeds, dataset.meta)
     episodes = dataset.meta.episodes
     starts, ends = episodes["dataset_from_index"], episodes["dataset_to_index"]
@@ -117,27 +137,42 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], group: int, parent:
         initial=runs.step * len(seeds),
         desc="Training",
         unit="seed-step",
-        disable=parent is not None,
+        disable=count is not None,
     )
     window: list[Tensor] = []
     while runs.step < config.steps:
-        if parent is not None and os.getppid() != parent:
-            raise SystemExit("the command has ended")
-        count = min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))
-        for drawn in _draw(runs, orders, frames, count):
+        for drawn in _draw(runs, orders, frames, min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))):
             window.append(runs.stack.step(drawn))
             runs.step += 1
-            if config.log_freq > 0 and runs.step % config.log_freq == 0:
-                means = torch.stack(window).mean(dim=0).tolist()
-                listed = ", ".join(f"{seed}: {loss:.4f}" for seed, loss in zip(seeds, means, strict=True))
-                logger.info("step %d, mean loss of %d steps by seed: %s", runs.step, len(window), listed)
-                window = []
-            if config.save_checkpoint and should_save_checkpoint(runs.step, config.save_freq, config.steps):
-                runs.save()
             bar.update(len(seeds))
-            if _progress is not None:
-                _progress[group] += len(seeds)
+            if count is not None:
+                count()
+            if runs.step % (config.log_freq or STEPS_AT_ONCE) == 0:
+                window = _report(seeds, runs.step, window, config.log_freq > 0)
+        if should_save_checkpoint(runs.step, config.save_freq, config.steps):
+            window = _report(seeds, runs.step, window, False)
+            runs.save()
     bar.close()
+
+
+def _report(seeds: list[int], step: int, losses: list[Tensor], log: bool) -> list[Tensor]:
+    """Log the mean loss of each seed over some steps; returns an empty list for the next ones.
+
+    Raises:
+        ValueError: If a loss is not finite.
+    """
+    if not losses:
+        return []
+    means = torch.stack(losses).mean(dim=0).tolist()
+    broken = [seed for seed, mean in zip(seeds, means, strict=True) if not math.isfinite(mean)]
+    if broken:
+        raise ValueError(
+            f"seeds {broken}: the loss is not finite by step {step}; lower policy.optimizer_lr and train anew"
+        )
+    if log:
+        listed = ", ".join(f"{seed}: {loss:.4f}" for seed, loss in zip(seeds, means, strict=True))
+        logger.info("step %d, mean loss of %d steps by seed: %s", step, len(losses), listed)
+    return []
 
 
 def _keep_freed_memory() -> None:
@@ -145,7 +180,7 @@ def _keep_freed_memory() -> None:
 
     It would give large blocks back to the system, and every step would have the gradients' pages mapped anew.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, 32 << 20)
         mallopt(M_TRIM_THRESHOLD, 512 << 20)
