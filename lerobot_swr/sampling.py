@@ -93,7 +93,9 @@ class SimilarityWeightedSampler:
             self._largest = np.full(len(marked), self._row_largest[self._candidate_list].max())
         # Shares of the pairs, cumulative over partners: rows are filled when they are needed.
         self._shares = np.empty((len(marked), len(self._candidate_list)))  # (N, M)
+        self._mass = np.empty(len(marked))  # (N,) their sum
         self._has_shares = np.zeros(len(marked), dtype=bool)
+        self._all_filled = False
         self._effective_demos = None
 
     def nu(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
@@ -136,23 +138,24 @@ class SimilarityWeightedSampler:
     def _draw_weighted(
         self, own: np.ndarray, numbers: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if not self._has_shares[own].all():
-            self._fill_shares(np.unique(own[~self._has_shares[own]]))
-        shares = self._shares[own]  # (B, M)
-        total = shares[:, -1]
-        # Inverse distribution function; the numbers stay below 1, lest rounding lead past the last share.
-        threshold = np.minimum(numbers, 1 - 1e-9) * total
-        place = np.minimum((shares <= threshold[:, None]).sum(axis=1), shares.shape[1] - 1)
-        styles = self._candidate_list[place]
-        return styles, total, styles != own
+        if not self._all_filled:
+            self._fill_shares(own)
+        mass = self._mass[own]
+        # Inverse distribution function: how many cumulative shares lie at or below the number.
+        place = (self._shares[own] <= (numbers * mass)[:, None]).sum(axis=1)
+        styles = self._candidate_list.take(place, mode="clip")
+        return styles, mass, styles != own
 
     def _fill_shares(self, episodes: np.ndarray) -> None:
         """Pairs (i, j) of `episodes`: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i, summed up over j."""
+        episodes = np.unique(episodes[~self._has_shares[episodes]])
         others = len(self._candidate_list) - 1
         shares = np.exp(-self.beta * self.nu(episodes[:, None], self._candidate_list)) * (self.p / others)
         shares[np.arange(len(episodes)), self._place[episodes]] = 1 - self.p
         self._shares[episodes] = shares.cumsum(axis=1)
+        self._mass[episodes] = self._shares[episodes, -1]
         self._has_shares[episodes] = True
+        self._all_filled = bool(self._has_shares[self._candidate_list].all())
 
     @property
     def effective_demos(self) -> float:
@@ -215,7 +218,8 @@ class StepGenerator(nn.Module):
         known = self._blocks.get(count)
         if known is None or known[0] != entropy:
             generator = np.random.default_rng([*entropy, count])
-            known = (entropy, generator.random((STEPS_PER_BLOCK, count)))
+            # A little below 1, lest a product with such a number be rounded up to its other factor.
+            known = (entropy, np.minimum(generator.random((STEPS_PER_BLOCK, count)), 1 - 1e-9))
             self._blocks = {**{k: v for k, v in self._blocks.items() if v[0] == entropy}, count: known}
         return known[1]
 

@@ -16,7 +16,7 @@ GENERATOR = torch.Generator()
 def draw(sampler, episodes):
     """Pairs from fresh uniform numbers."""
     uniforms = torch.rand(len(episodes), generator=GENERATOR, dtype=torch.float64)
-    return sampler.draw(episodes, uniforms.numpy())
+    return sampler.draw(episodes, uniforms.numpy() * (1 - 1e-9))
 
 
 def make_sampler(**options) -> SimilarityWeightedSampler:
