@@ -22,7 +22,7 @@ demo: $(READY)  ## Train BC, ZBC and WZBC on two mazes and write outputs/demo/re
 	HF_HUB_OFFLINE=1 $(BIN)/lerobot-swr-demo --output_dir=outputs/demo
 
 test: $(READY)  ## Run the fast tests (minutes)
-	HF_HUB_OFFLINE=1 $(BIN)/python -m pytest
+	HF_HUB_OFFLINE=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile
 
 slow: $(READY)  ## Run the tests that train policies to their full quality (an hour)
 	HF_HUB_OFFLINE=1 $(BIN)/python -m pytest -m slow
