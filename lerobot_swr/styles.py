@@ -99,6 +99,10 @@ class StyleCookbook(nn.Module):
         self.selection, self.blend = selection, None
         self._queues: dict[str | None, list[int]] = {}
 
+    def restart(self) -> None:
+        """Begin anew where styles are drawn in turn: the next rollouts do not depend on earlier ones."""
+        self._queues = {}
+
     def interpolate(self, i: int, j: int, share: float) -> None:
         """From the next rollout on use the blend (1 − share) z_i + share z_j, until `select` or `restrict`.
 

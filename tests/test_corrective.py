@@ -231,6 +231,19 @@ def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
 # --- Feedback and labels ---
 
 
+def test_dimensions_without_a_model_keep_the_demonstrated_action(maze):
+    """A gripper that no state predicts stays fully open or closed, however far off the path the arm is."""
+    gripper = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(maze.columns[ACTION]), 1))
+    actions = np.concatenate([maze.columns[ACTION], gripper.astype(np.float32)], axis=1)
+    with_gripper = Trajectories(maze.lengths, {**maze.columns, ACTION: actions}, maze.fps, maze.name)
+    feedback = Feedback(with_gripper, fit_inverse_model(with_gripper))
+    assert feedback.corrected.tolist() == [True, True, False]
+    rows = torch.arange(0, len(actions), 10)
+    acted = feedback.act(feedback.paths.states[rows] + 0.3, rows)
+    assert torch.equal(acted[:, 2], torch.from_numpy(actions)[rows, 2])
+    assert (acted[:, :2].abs() <= feedback.limits[:2] * (1 + 1e-6)).all()
+
+
 def test_the_limiter_scales_and_never_turns_an_action(maze):
     """Actions keep their direction, end within ± the largest demonstrated magnitude, and small ones stay."""
     feedback = Feedback(maze, fit_inverse_model(maze))

@@ -41,6 +41,18 @@ def test_playback_repeats_its_demonstration(demonstrations):
         np.testing.assert_allclose(rollout.observations[STATE][: len(path)], path, atol=0.01)
 
 
+def test_rollouts_do_not_depend_on_those_before_them(demonstrations):
+    """Fewer rollouts than styles, each style once: the same styles again with the same seed."""
+    env = Maze2DEnvConfig(task="small", episode_length=20)
+    checkpoint = playback_checkpoint(demonstrations, "stratified")
+    drawn = [
+        [r.style_episode for r in run_rollouts(checkpoint, env, env.behavior_rule(), 4, 3, seed=1)]
+        for _ in range(3)
+    ]
+    assert drawn[0] == drawn[1] == drawn[2]
+    assert len(set(drawn[0])) == 4
+
+
 def test_playback_comes_back_where_blind_replay_does_not(demonstrations):
     """Pushed aside, playback ends within a step of where the undisturbed one does; open loop stays aside."""
     policy = PlaybackPolicy(demonstrations, "fixed")

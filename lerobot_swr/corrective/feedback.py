@@ -28,6 +28,7 @@ class Feedback:
         self.actions = torch.from_numpy(trajectories.columns[ACTION])
         self.gain = torch.from_numpy(model.gain.astype(np.float32))  # (A, d)
         self.targets = torch.from_numpy(model.targets)
+        self.corrected = (self.gain != 0).any(dim=1)  # (A,) bool
         self._has_targets = bool((self.targets >= 0).any())
         demonstrated = relative_to_state(self.actions, self.paths.states, self.targets)
         # (A,); above 0, so that an action dimension that is never used is limited to (almost) nothing
@@ -37,7 +38,7 @@ class Feedback:
         """Move everything to a device; nothing happens if it is there."""
         self.paths.to(device)
         if self.actions.device != device:
-            for name in ("actions", "gain", "targets", "limits"):
+            for name in ("actions", "gain", "corrected", "targets", "limits"):
                 setattr(self, name, getattr(self, name).to(device))
 
     def act(self, states: Tensor, matched: Tensor) -> Tensor:
@@ -49,6 +50,9 @@ class Feedback:
         return corrected - relative + self.limit(relative)
 
     def limit(self, actions: Tensor) -> Tensor:
-        """Scale each of the (B, A) actions, relative where they are targets, into the symmetric range."""
-        excess = (actions.abs() / self.limits).amax(dim=1)
-        return actions / excess.clamp(min=1)[:, None]
+        """Scale each of the (B, A) actions, relative where they are targets, into the symmetric range.
+
+        Dimensions that are not corrected neither ask for it nor take part.
+        """
+        excess = torch.where(self.corrected, actions.abs() / self.limits, 0).amax(dim=1)
+        return torch.where(self.corrected, actions / excess.clamp(min=1)[:, None], actions)

@@ -117,6 +117,8 @@ def run_rollouts(
     """
     env_seeds = range(seed, seed + n_episodes) if env_seeds is None else env_seeds
     set_seed(seed)
+    if checkpoint.has_styles:
+        checkpoint.policy.styles.restart()  # type: ignore[union-attr, operator]
     env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg, checkpoint.policy.config)
     rollouts: list[Rollout] = []
     while len(rollouts) < n_episodes:
