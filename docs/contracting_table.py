@@ -4,6 +4,7 @@ Several files of one policy (its training seeds) are pooled: python docs/contrac
 "zbc=outputs/contracting/none/seed_*/robustness.json" "playback=outputs/contracting/playback/robustness.json"
 """
 
+import glob
 import json
 import sys
 from pathlib import Path
@@ -24,7 +25,7 @@ def main() -> None:
     policies = {}
     for argument in sys.argv[1:]:
         name, _, pattern = argument.partition("=")
-        files = sorted(Path().glob(pattern)) if not Path(pattern).is_file() else [Path(pattern)]
+        files = [Path(name) for name in sorted(glob.glob(pattern))]
         policies[name] = [json.loads(file.read_text())["cells"] for file in files]
         if not files:
             sys.exit(f"{argument!r}: no such file")
