@@ -329,3 +329,11 @@ def test_killed_in_the_middle_of_a_training_a_suite_ends_with_the_same_results(
     assert results["whole"] == results["killed"]
     assert results["whole weights"] == results["killed weights"]
     assert len(results["whole weights"]) == 2
+
+
+def test_an_option_that_a_policy_lacks_is_named(settings, demos):
+    """bc has no styles: the key, the policy and the way out, not a stack trace."""
+    settings = dataclasses.replace(settings, policy_options={"style_dim": 4})
+    assert training(settings, demos, "zbc").definition["config"]["style_dim"] == 4
+    with pytest.raises(ValueError, match=r"'bc' has no option 'style_dim'; .*--policies"):
+        training(settings, demos, "bc")

@@ -1,6 +1,7 @@
 """The paper's experiments as lists of cells: what is compared is fixed here, before any training."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import draccus
@@ -88,7 +89,14 @@ def training(
         baseline = BASELINES[policy]
         all_options, batch_size = dict(baseline.options), baseline.batch_size
         default_steps, default_seeds = getattr(settings, baseline.steps), settings.baseline_seeds
-    config = PreTrainedConfig.get_choice_class(policy)(device="cpu", push_to_hub=False, **all_options)
+    make = PreTrainedConfig.get_choice_class(policy)
+    unknown = sorted(all_options.keys() - {option.name for option in fields(make)})
+    if unknown:
+        raise ValueError(
+            f"policy_options={dict(settings.policy_options)}: {policy!r} has no option {unknown[0]!r}; "
+            "choose the policies that have it with --policies=[...]"
+        )
+    config = make(device="cpu", push_to_hub=False, **all_options)
     definition = {
         "fingerprint": demos.fingerprint,
         "policy": policy,

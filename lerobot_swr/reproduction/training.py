@@ -66,7 +66,9 @@ def steps_done(cell: Cell, store: Store) -> float:
 
 def _train_alone(cell: Cell, store: Store, dataset: Path, run: Path, seed: int, lock: int) -> None:
     """One seed by lerobot-train."""
-    if checkpoint_folder(cell, store, seed).is_dir():
+    # The link is written after everything that it points to; the folder alone may be half-written.
+    last = (run / "checkpoints" / "last").resolve()
+    if last == checkpoint_folder(cell, store, seed).parent.resolve() and last.is_dir():
         return
     config = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
     executable = [str(Path(sys.executable).with_name("lerobot-train"))]
