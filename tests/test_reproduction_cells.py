@@ -20,8 +20,9 @@ from lerobot_swr.reproduction.baselines import BASELINES, known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
+from lerobot_swr.reproduction.experiments import evaluation, training, variant_name
 from lerobot_swr.reproduction.settings import ReproductionSettings
-from lerobot_swr.reproduction.suites import evaluation, suite_cells, training
+from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.reproduction.training import checkpoint_folder
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -97,6 +98,44 @@ def test_other_demonstrations_are_a_new_cell(settings, demos):
     key = training(settings, demos, "zbc").key
     assert training(settings, other, "zbc").key != key
     assert training(settings, renamed, "zbc").key == key
+
+
+def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
+    """Defaults given or not, numbers whole or not, through the settings or a suite: one key, one name."""
+    plain = training(dataclasses.replace(settings, policy_options={}), demos, "wzbc")
+    for given in ({"beta": 10.0, "p": 0.8}, {"beta": 10}, {"p": 0.8}):
+        asked = training(dataclasses.replace(settings, policy_options={}), demos, "wzbc", given)
+        assert (asked.key, asked.slug) == (plain.key, plain.slug)
+        asked = training(dataclasses.replace(settings, policy_options=given), demos, "wzbc")
+        assert (asked.key, asked.slug) == (plain.key, plain.slug)
+    settings = dataclasses.replace(settings, sweep_steps=settings.steps, sweep_seeds=settings.seeds)
+    suites = {name: suite_cells(name, settings, [demos]) for name in ("table1", "robustness", "figures")}
+    wzbc = [
+        {cell for cell in cells if cell.kind == "train" and cell.labels.policy.startswith("wzbc")}
+        for cells in suites.values()
+    ]
+    assert len(set.intersection(*wzbc)) == 1
+    assert len(set.union(*wzbc)) == len(wzbc[2])
+
+
+def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
+    """Whole configurations are compared; every option that differs makes another cell."""
+    trained = training(settings, demos, "zbc")
+    plain = evaluation(settings, demos, trained, "x")
+    same = evaluation(settings, demos, trained, "x", {"transition_noise": 0, "start_radius": 0.10})
+    assert same.key == plain.key
+    for option in ({"transition_noise": 1.0}, {"episode_length": 150}, {"sticky_walls": True}):
+        assert evaluation(settings, demos, trained, "x", option).key != plain.key
+    assert plain.definition["env"]["episode_length"] == 200
+
+
+def test_names_tell_what_differs(settings, demos):
+    """Numbers short, words as they are; options of the settings, too."""
+    differing = {"beta": 3.0, "corrective": "demos", "residual": False, "style_dim": 4}
+    assert variant_name("wzbc", differing) == "wzbc beta=3 corrective=demos residual=False style_dim=4"
+    assert training(settings, demos, "zbc").labels.policy == "zbc hidden_dim=16"
+    both = training(settings, demos, "zbc", {"corrective": "demos"})
+    assert both.labels.policy == "zbc hidden_dim=16 corrective=demos"
 
 
 def test_a_result_appears_complete_or_not_at_all(store, monkeypatch):

@@ -1,9 +1,11 @@
 """The datasets of the experiments: made where absent, and described for everything that comes after."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import draccus
 import numpy as np
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION
@@ -89,10 +91,9 @@ def load_low_dimensional(root: Path) -> Trajectories:
     )
 
 
-def environment(options: dict[str, Any]) -> TaskEnvConfig:
-    """The environment's configuration from its options."""
-    options = dict(options)
-    config = EnvConfig.get_choice_class(options.pop("type"))(**options)
+def environment(options: Mapping[str, Any]) -> TaskEnvConfig:
+    """The environment's configuration from its type and the options that differ from its defaults, or all."""
+    config = draccus.decode(EnvConfig, dict(options))
     assert isinstance(config, TaskEnvConfig)
     return config
 

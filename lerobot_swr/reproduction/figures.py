@@ -208,7 +208,7 @@ def plot_style_maps(path: Path, demonstrations: DatasetDescription, cells: Seque
 
 def plot_sweep(path: Path, cells: Sequence[StoredCell]) -> None:
     """Effect of β (at one p) and of p (at one β) on L1, success and style fidelity."""
-    options = [cell.training["options"] for cell in cells if cell.training is not None]
+    options = [cell.training["config"] for cell in cells if cell.training is not None]
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     for axes, name, other in zip(figure.subplots(1, 2), ("beta", "p"), ("p", "beta"), strict=True):
         values = [o[other] for o in options]

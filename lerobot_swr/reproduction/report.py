@@ -85,7 +85,7 @@ def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
 
 
 def _baseline_note(suite: SuiteResults, dataset: str) -> list[str]:
-    others = [c for c in suite.evaluations(dataset) if c.labels.policy not in ("bc", "zbc", "wzbc")]
+    others = [c for c in suite.evaluations(dataset) if c.policy not in ("bc", "zbc", "wzbc")]
     if not others:
         return []
     names = ", ".join(c.labels.policy for c in others)

@@ -58,6 +58,11 @@ class StoredCell:
     demonstrations: DatasetDescription
     training: Mapping[str, Any] | None
 
+    @property
+    def policy(self) -> str:
+        """Type of the policy, without what differs from its usual options."""
+        return self.labels.policy.split(" ")[0]
+
     @cached_property
     def protocols(self) -> list[str]:
         """Ways of drawing styles that an evaluation has, the last one the better one to compare with."""

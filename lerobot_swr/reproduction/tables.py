@@ -73,7 +73,7 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
                 rollouts(uniform),
                 l1(uniform),
                 floor(uniform),
-                number(paper.TABLE1_L1.get((dataset, cell.labels.policy))),
+                number(paper.TABLE1_L1.get((dataset, cell.policy))),
                 l1(stratified),
                 NOTHING if stratified is None else f"{stratified.floor.mean:.3f}",
                 share(cell.best.success),
@@ -147,11 +147,13 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
 
 def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
     """Every WZBC against ZBC under the same starts and noise."""
-    cells = {(c.labels.policy, c.labels.condition): c for c in suite.evaluations(dataset)}
+    evaluations = suite.evaluations(dataset)
+    cells = {(c.labels.policy, c.labels.condition): c for c in evaluations}
+    references = {c.labels.condition: c for c in evaluations if c.policy == "zbc"}
     policies = [name for name in dict.fromkeys(name for name, _ in cells) if name.startswith("wzbc")]
     rows = []
     for condition in dict.fromkeys(condition for _, condition in cells):
-        reference = cells.get(("zbc", condition))
+        reference = references.get(condition)
         if reference is not None:
             pairs = [(cells.get((policy, condition)), reference) for policy in policies]
             rows.append((condition, *(_difference(*pair, column) for column in (0, 1) for pair in pairs)))
@@ -248,7 +250,7 @@ def sweep(cells: Sequence[StoredCell]) -> Table:
     rows = []
     for cell in cells:
         assert cell.training is not None
-        options = cell.training["options"]
+        options = cell.training["config"]
         rows.append(
             (
                 f"{options['beta']:g}",
