@@ -1,6 +1,7 @@
 """Cells of the paper's experiments: identity, storage, resuming, failures."""
 
 import dataclasses
+import itertools
 import json
 import os
 import signal
@@ -21,7 +22,8 @@ from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
 from lerobot_swr.reproduction.experiments import evaluation, training, variant_name
-from lerobot_swr.reproduction.settings import ReproductionSettings
+from lerobot_swr.reproduction.measurement import environment_seed
+from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
 from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.reproduction.training import checkpoint_folder
 
@@ -220,6 +222,54 @@ def test_a_failed_cell_does_not_stop_the_others(settings, demos, store, trained,
     monkeypatch.undo()
     assert run_cells([bad, good], store, {demos.name: demos}, jobs=1) == []
     assert store.state(bad) == "done"
+
+
+def test_a_result_that_cannot_be_written_fails_its_cell_alone(settings, demos, store, trained, monkeypatch):
+    """A full disk at the end of a cell: it is named, the next one is computed."""
+    first = evaluation(settings, demos, trained, "deterministic")
+    second = evaluation(settings, demos, trained, "noise", {"transition_noise": 1.0})
+    write = Store.write
+
+    def full(self, one, *args):
+        if one == first:
+            raise OSError("no space left")
+        write(self, one, *args)
+
+    monkeypatch.setattr(Store, "write", full)
+    [failure] = run_cells([trained, first, second], store, {demos.name: demos}, jobs=1)
+    assert (failure.cell, "no space left" in failure.message) == (first, True)
+    assert (store.state(first), store.state(second)) == ("failed", "done")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_fails_the_cell_that_killed_it_alone(demos, store, monkeypatch):
+    """Four chains on two workers: the one that kills its process is named, the others end."""
+
+    def run_in_worker(chain, *args):
+        def compute(one, *_):
+            if one.labels.condition == "deadly":
+                os.kill(os.getpid(), signal.SIGKILL)
+            return {}
+
+        execution._compute = compute  # of the worker process
+        return run_chain(chain, *args)
+
+    names = ("harmless", "deadly", "unharmed", "unaffected")
+    cells = [Cell("similarity", Labels(demos.name, "", name), {"name": name}) for name in names]
+    monkeypatch.setattr(execution, "run_chain", run_in_worker)
+    [failure] = run_cells(cells, store, {demos.name: demos}, jobs=2)
+    assert failure.cell == cells[1]
+    assert "killed" in failure.message
+    assert [store.state(one) for one in cells] == ["done", "failed", "done", "done"]
+    assert "killed" in failure.log.read_text()
+
+
+def test_training_seeds_never_share_an_environment_seed():
+    """However many rollouts are allowed."""
+    first = [environment_seed(1000, seed) for seed in range(5)]
+    assert all(b - a >= MAX_ROLLOUTS for a, b in itertools.pairwise(first))
+    with pytest.raises(ValueError, match=r"n_rollouts=100001: expected at most 100,000"):
+        ReproductionSettings(n_rollouts=MAX_ROLLOUTS + 1)
 
 
 def test_a_failed_training_leaves_its_measurements_waiting(settings, demos, store, monkeypatch):

@@ -116,6 +116,14 @@ class Store:
         """The file that a failed attempt leaves and the next attempt removes."""
         return self.work_folder(cell) / "failed.txt"
 
+    def running_path(self, cell: Cell) -> Path:
+        """The file that is there while the cell is computed, and stays if that is killed."""
+        return self.work_folder(cell) / "running"
+
+    def is_running(self, cell: Cell) -> bool:
+        """Whether an attempt has begun and not come to an end."""
+        return self.running_path(cell).is_file()
+
     def read(self, cell: Cell) -> dict[str, Any]:
         """The result of a finished cell."""
         return json.loads(self.result_path(cell).read_text())["result"]

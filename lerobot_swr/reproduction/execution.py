@@ -7,6 +7,7 @@ import threading
 import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -65,12 +66,12 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
     suites = {name: settings.choose_datasets(DATASETS[name]) for name in settings.suites}
     names = dict.fromkeys(name for datasets in suites.values() for name in datasets)
     prepared = {name: prepare(name, settings.dataset_folder, store) for name in names}
-    cells: dict[Cell, None] = {}
+    cells: dict[Cell, Cell] = {}  # the first name of what several suites ask for
     for suite, datasets in suites.items():
         of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])
+        of_suite = [cells.setdefault(cell, cell) for cell in of_suite]
         if of_suite and not settings.dry_run:
             _write_manifest(store, suite, command, of_suite, [prepared[name] for name in datasets])
-        cells.update(dict.fromkeys(of_suite))
     if not cells:
         raise ValueError(f"datasets={settings.datasets}, policies={settings.policies}: nothing to run")
     if settings.dry_run:
@@ -87,7 +88,8 @@ def run_cells(
     """Compute the cells that are not finished.
 
     A training and everything measured on it form a chain, which one worker goes through; chains run in
-    parallel.
+    parallel. If a worker process is killed (out of memory, say), those chains that were under way are run
+    again, one at a time after all others; whichever kills its worker again has failed.
 
     Args:
         cells: The cells, in any order.
@@ -98,9 +100,43 @@ def run_cells(
     chains = unfinished_chains(cells, store)
     workers = {} if jobs is None else {"n_jobs": jobs}
     roots = {name: demos.root.resolve() for name, demos in datasets.items()}
+    for cell in (cell for chain in chains for cell in chain):
+        store.failure_path(cell).unlink(missing_ok=True)
+        store.running_path(cell).unlink(missing_ok=True)
+    failures: dict[Cell, Failure] = {}
+
+    def attempt(chosen: list[list[Cell]]) -> list[list[Cell]]:
+        """Run chains; those that were under way when a worker was killed."""
+        try:
+            outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chosen)
+            failures.update({failure.cell: failure for of_chain in outcomes for failure in of_chain})
+            return []
+        except BrokenProcessPool:
+            known = [cell for chain in chosen for cell in chain if store.failure_path(cell).is_file()]
+            failures.update({cell: _stored_failure(cell, store) for cell in known})
+            under_way = [chain for chain in chosen if any(map(store.is_running, chain))]
+            return under_way or chosen[:1]
+
     with _progress([cell for chain in chains for cell in chain], store):
-        outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chains)
-    return [failure for failures in outcomes for failure in failures]
+        alone: list[list[Cell]] = []
+        while chains:
+            interrupted = attempt(chains)
+            alone += interrupted
+            left = [_left_of(chain, store, failures) for chain in chains if chain not in interrupted]
+            chains = [chain for chain in left if chain] if interrupted else []
+        for chain in alone:
+            while chain := _left_of(chain, store, failures):
+                if attempt([chain]):
+                    culprit = next(filter(store.is_running, chain), chain[0])
+                    failures[culprit] = _failed(culprit, store, "its worker process was killed twice")
+    return list(failures.values())
+
+
+def _left_of(chain: Sequence[Cell], store: Store, failures: Mapping[Cell, Failure]) -> list[Cell]:
+    """What is still to be computed of a chain, except for what has failed."""
+    if any(cell.kind == "train" and cell in failures for cell in chain):
+        return []
+    return [cell for cell in chain if cell not in failures and not _is_finished(cell, store)]
 
 
 def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
@@ -141,26 +177,38 @@ def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path])
 
 
 def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
-    with store.lock(cell) as lock:
-        if _is_finished(cell, store):  # by another command meanwhile
-            return None
-        store.failure_path(cell).unlink(missing_ok=True)
-        start = time.monotonic()
-        try:
+    try:
+        with store.lock(cell) as lock:
+            if _is_finished(cell, store):  # by another command meanwhile
+                return None
+            store.failure_path(cell).unlink(missing_ok=True)
+            store.running_path(cell).touch()
+            start = time.monotonic()
             with (
                 store.log_path(cell).open("a") as log,
                 contextlib.redirect_stdout(log),
                 contextlib.redirect_stderr(log),
             ):
                 result = _compute(cell, store, dataset, lock)
-        except Exception as error:
-            with store.log_path(cell).open("a") as log:
-                traceback.print_exc(file=log)
-            message = f"{type(error).__name__}: {error}"
-            write_text(store.failure_path(cell), message + "\n")
-            return Failure(cell, message, store.log_path(cell))
-        store.write(cell, result, time.monotonic() - start)
-        return None
+            store.write(cell, result, time.monotonic() - start)
+            store.running_path(cell).unlink(missing_ok=True)
+            return None
+    except Exception as error:
+        return _failed(cell, store, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def _failed(cell: Cell, store: Store, message: str, details: str = "") -> Failure:
+    """Note a failure; where even that cannot be written (disk full), the command still names it."""
+    with contextlib.suppress(OSError):
+        store.running_path(cell).unlink(missing_ok=True)
+        write_text(store.failure_path(cell), message + "\n")
+        with store.log_path(cell).open("a") as log:
+            log.write(details or message + "\n")
+    return Failure(cell, message, store.log_path(cell))
+
+
+def _stored_failure(cell: Cell, store: Store) -> Failure:
+    return Failure(cell, store.failure_path(cell).read_text().strip(), store.log_path(cell))
 
 
 def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_ch
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import environment, short_path
+from lerobot_swr.reproduction.settings import MAX_ROLLOUTS
 from lerobot_swr.reproduction.training import checkpoint_folder
 
 BATCH_SIZE = 100  # environments that run at once
@@ -58,8 +59,7 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     rule = env_cfg.behavior_rule()
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     count = definition["protocols"][protocol]
-    # Rollout k of a training seed meets the same start and noise whatever the policy.
-    env_seed = definition["seed"] * (seed + 1)
+    env_seed = environment_seed(definition["seed"], seed)
     rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed)
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
@@ -68,6 +68,15 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
         "paths": [short_path(path_of(env_cfg, rollout.observations)) for rollout in drawn],
     }
+
+
+def environment_seed(first: int, training_seed: int) -> int:
+    """Seed of a training seed's first rollout, the next ones count on from it.
+
+    Rollout k of a training seed meets the same start and noise whatever the policy; no two training seeds
+    share a start or noise.
+    """
+    return first + training_seed * MAX_ROLLOUTS
 
 
 def load_policy(folder: Path, style_sampling: str | None, style_filter: str | None) -> Checkpoint:
