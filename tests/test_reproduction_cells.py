@@ -20,9 +20,10 @@ from lerobot_swr.reproduction import execution, measurement
 from lerobot_swr.reproduction.baselines import BASELINES, known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
-from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
-from lerobot_swr.reproduction.experiments import evaluation, training, variant_name
+from lerobot_swr.reproduction.execution import run_cells, run_chain
+from lerobot_swr.reproduction.experiments import evaluation, playback, training, variant_name
 from lerobot_swr.reproduction.measurement import environment_seed
+from lerobot_swr.reproduction.planning import format_states, format_work, unfinished_chains
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
 from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.reproduction.training import checkpoint_folder
@@ -310,6 +311,66 @@ def test_every_style_is_used_equally_often(settings, demos):
         changed = dataclasses.replace(settings, n_rollouts=n_rollouts)
         one = evaluation(changed, demos, training(changed, demos, "zbc"), "x")
         assert one.definition["protocols"] == {"uniform": n_rollouts, "stratified": expected}
+
+
+def test_contracting_shares_its_plain_trainings_and_their_measurements(settings, demos):
+    """All that robustness measures on zbc and wzbc is the same cell; corrective ones train as long."""
+    suites = {name: set(suite_cells(name, settings, [demos])) for name in ("robustness", "contracting")}
+    plain = {cell for cell in suites["robustness"] if cell.labels.policy.split(" ")[0] in ("zbc", "wzbc")}
+    assert plain <= suites["contracting"]
+    trained = [cell for cell in suites["contracting"] if cell.kind == "train"]
+    chosen = sorted((c.definition["policy"], c.definition["config"]["corrective"]) for c in trained)
+    assert chosen == [("wzbc", "none"), ("zbc", "demos"), ("zbc", "noise"), ("zbc", "none")]
+    assert {(c.definition["steps"], c.definition["batch_size"]) for c in trained} == {(20, 16)}
+
+
+def test_the_other_wzbc_are_trained_on_spread_out_alone(settings, demos):
+    """p = 0.95 and beta = 3 in the suite robustness."""
+    named = {
+        name: {cell.labels.policy for cell in suite_cells("robustness", settings, [d])}
+        for name, d in (("a", demos), ("b", dataclasses.replace(demos, name="medium_maze-spread_out")))
+    }
+    assert {policy.replace(" hidden_dim=16", "") for policy in named["b"] - named["a"]} == {
+        "wzbc p=0.95",
+        "wzbc beta=3",
+    }
+
+
+def test_the_arms_tasks_are_perturbed_as_their_environment_offers(settings, demos):
+    """Shifted starts, noisy actions and, for aligning, a pushed box; the plain task first."""
+    for task, pushes in (("avoiding", set()), ("aligning", {0.02, 0.05})):
+        arm = dataclasses.replace(demos, env={"type": "d3il", "task": task})
+        cells = [c for c in suite_cells("contracting", settings, [arm]) if c.labels.policy == "playback"]
+        envs = [cell.definition["env"] for cell in cells]
+        assert cells[0].labels.condition == "deterministic"
+        assert {env["start_radius"] for env in envs} == {0.0, 0.02, 0.04}
+        assert {env["action_noise"] for env in envs} == {0.0, 0.002, 0.004}
+        assert {env["box_push"] for env in envs} == {0.0} | pushes
+
+
+def test_playback_is_measured_without_a_training(settings, demos, store):
+    """As many rollouts per seed as a policy's; on its own demonstrations it succeeds and keeps the style."""
+    one = playback(settings, demos, "deterministic")
+    assert run_cells([one], store, {demos.name: demos}, jobs=1) == []
+    rollouts = store.read(one)["rollouts"]
+    assert list(rollouts) == ["0", "1"]
+    for part in rollouts.values():
+        assert sorted(part["stratified"]["style"]) == [style for style in range(6) for _ in range(2)]
+        assert sum(part["stratified"]["success"]) == sum(part["stratified"]["match"]) == 12
+
+
+def test_the_work_that_is_left_is_counted(settings, demos, store, trained):
+    """Seed-steps of trainings and rollouts, neither of finished cells nor of trainings not needed again."""
+    wzbc = training(settings, demos, "wzbc")
+    cells = [trained, wzbc, *(evaluation(settings, demos, one, "x") for one in (trained, wzbc))]
+    assert format_work(cells, store) == (
+        "left: 40 seed-steps in 1 trainings by lerobot-swr-train, "
+        "0 seed-steps in 0 trainings by lerobot-train, 96 rollouts in 2 evaluations"
+    )
+    half = store.work_folder(wzbc) / "run" / "seed_0" / "checkpoints" / "000010"
+    half.mkdir(parents=True)
+    assert "left: 30 seed-steps" in format_work(cells, store)
+    assert format_work([trained], store).startswith("left: 0 seed-steps in 0 trainings")
 
 
 def test_policies_without_styles_are_rolled_out_once(settings, demos):

@@ -2,11 +2,9 @@
 
 import contextlib
 import json
-import sys
-import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +12,22 @@ from typing import Any
 
 import torch
 from joblib import Parallel, delayed
-from tqdm import tqdm
 
 from lerobot_swr.reproduction.baselines import known_policies, missing_extras
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
+from lerobot_swr.reproduction.planning import (
+    format_states,
+    format_work,
+    is_finished,
+    progress,
+    unfinished_chains,
+)
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
 from lerobot_swr.reproduction.suites import DATASETS, suite_cells
-from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done, train
-
-LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
+from lerobot_swr.reproduction.training import train
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
         raise ValueError(f"datasets={settings.datasets}, policies={settings.policies}: nothing to run")
     if settings.dry_run:
         print(format_states(list(cells), store))
+        print(format_work(list(cells), store))
         return []
     failures = run_cells(list(cells), store, prepared, settings.jobs)
     print(format_states(list(cells), store))
@@ -117,7 +120,7 @@ def run_cells(
             under_way = [chain for chain in chosen if any(map(store.is_running, chain))]
             return under_way or chosen[:1]
 
-    with _progress([cell for chain in chains for cell in chain], store):
+    with progress([cell for chain in chains for cell in chain], store):
         alone: list[list[Cell]] = []
         while chains:
             interrupted = attempt(chains)
@@ -136,32 +139,7 @@ def _left_of(chain: Sequence[Cell], store: Store, failures: Mapping[Cell, Failur
     """What is still to be computed of a chain, except for what has failed."""
     if any(cell.kind == "train" and cell in failures for cell in chain):
         return []
-    return [cell for cell in chain if cell not in failures and not _is_finished(cell, store)]
-
-
-def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
-    """What is left to compute: each chain is a training and what depends on it, or a cell on its own.
-
-    A training whose dependants are all finished is not asked for again; one whose checkpoints are gone is,
-    if something still depends on it. Long trainings come first.
-    """
-    chains: list[list[Cell]] = []
-    for root in dict.fromkeys(cell.needs or cell for cell in cells):
-        waiting = [cell for cell in cells if cell.needs == root and not store.is_done(cell)]
-        wanted = bool(waiting) if root.kind == "train" else True
-        if wanted and not _is_finished(root, store):
-            waiting.insert(0, root)
-        if waiting:
-            chains.append(waiting)
-
-    def work(chain: list[Cell]) -> int:
-        root = chain[0]
-        if root.kind != "train":
-            return 0
-        seed_steps = root.definition["steps"] * len(root.definition["seeds"])
-        return seed_steps if root.definition["policy"] in STACKED else LEROBOT_TRAIN_SLOWNESS * seed_steps
-
-    return sorted(chains, key=work, reverse=True)
+    return [cell for cell in chain if cell not in failures and not is_finished(cell, store)]
 
 
 def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path]) -> list[Failure]:
@@ -179,7 +157,7 @@ def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path])
 def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
     try:
         with store.lock(cell) as lock:
-            if _is_finished(cell, store):  # by another command meanwhile
+            if is_finished(cell, store):  # by another command meanwhile
                 return None
             store.failure_path(cell).unlink(missing_ok=True)
             store.running_path(cell).touch()
@@ -223,22 +201,6 @@ def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, An
     return compute_similarity(cell, dataset)
 
 
-def format_states(cells: Sequence[Cell], store: Store) -> str:
-    """A table for the terminal: what is done, failed or waiting."""
-    rows = [(store.state(cell), str(cell.labels)) for cell in cells]
-    counts = {state: sum(s == state for s, _ in rows) for state in ("done", "failed", "waiting")}
-    lines = [f"{state:<8} {name}" for state, name in rows]
-    return "\n".join([*lines, ", ".join(f"{count} {state}" for state, count in counts.items())])
-
-
-def _is_finished(cell: Cell, store: Store) -> bool:
-    """Whether the result and, of a training, its checkpoints are there."""
-    if cell.kind != "train":
-        return store.is_done(cell)
-    folders = [checkpoint_folder(cell, store, seed) for seed in cell.definition["seeds"]]
-    return store.is_done(cell) and all(folder.is_dir() for folder in folders)
-
-
 def _check_policies(settings: ReproductionSettings) -> None:
     unknown = [name for name in settings.policies or [] if name not in known_policies()]
     if unknown:
@@ -262,32 +224,3 @@ def _write_manifest(
         "cells": [store.result_path(cell).name for cell in cells],
     }
     write_text(store.root / "suites" / f"{suite}.json", json.dumps(content, indent=1) + "\n")
-
-
-@contextlib.contextmanager
-def _progress(cells: Sequence[Cell], store: Store) -> Iterator[None]:
-    """A bar over the cells, fed from what they have written, whoever computes them."""
-    finished = threading.Event()
-    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout) as bar:
-
-        def watch() -> None:
-            while True:
-                last = finished.wait(2.0)
-                bar.n = round(sum(_share_done(cell, store) for cell in cells), 1)
-                bar.refresh()
-                if last:
-                    return
-
-        watcher = threading.Thread(target=watch, daemon=True)
-        watcher.start()
-        try:
-            yield
-        finally:
-            finished.set()
-            watcher.join()
-
-
-def _share_done(cell: Cell, store: Store) -> float:
-    if store.is_done(cell):
-        return 1.0
-    return steps_done(cell, store) if cell.kind == "train" else 0.0

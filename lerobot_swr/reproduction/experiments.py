@@ -19,6 +19,7 @@ from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
 
 EVALUATION_SEED = 1000
+PLAYBACK = "playback"  # with feedback: the baseline without a policy
 
 
 def training(
@@ -108,6 +109,35 @@ def evaluation(
         "paths": paths,
     }
     return Cell("evaluate", Labels(demos.name, trained.labels.policy, condition), definition, trained)
+
+
+def playback(
+    settings: ReproductionSettings,
+    demos: Demonstrations,
+    condition: str,
+    env: Mapping[str, Any] | None = None,
+    protocols: Sequence[str] = ("uniform", "stratified"),
+) -> Cell:
+    """An evaluation cell of playback with feedback, which needs no training.
+
+    As many rollouts as those of a policy, with the same starts and noise.
+
+    Args:
+        settings: Number of rollouts and seeds.
+        demos: The dataset.
+        condition: How it is called.
+        env: Options of the environment beyond its type and task.
+        protocols: Ways of drawing demonstrations.
+    """
+    definition = {
+        **_rolled_out(settings, demos, env, protocols),
+        "fingerprint": demos.fingerprint,
+        "baseline": PLAYBACK,
+        "seeds": list(range(settings.seeds)),
+        "style_filter": None,
+        "paths": False,
+    }
+    return Cell("evaluate", Labels(demos.name, PLAYBACK, condition), definition)
 
 
 def _rolled_out(

@@ -71,8 +71,9 @@ class StoredCell:
     @cached_property
     def summaries(self) -> dict[str, Summary]:
         """Of an evaluation, by way of drawing styles."""
-        demonstrated = self.demonstrations.result["behavior"]
-        return {protocol: summarize(self.result, protocol, demonstrated) for protocol in self.protocols}
+        described = self.demonstrations.result
+        labels, steps = described["behavior"], described["steps_to_end"]
+        return {protocol: summarize(self.result, protocol, labels, steps) for protocol in self.protocols}
 
     @property
     def best(self) -> Summary:

@@ -1,12 +1,12 @@
 """The paper's experiments as lists of cells: what is compared is fixed here, before any training."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations
-from lerobot_swr.reproduction.experiments import evaluation, training
+from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.experiments import evaluation, playback, training
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
 
@@ -20,14 +20,26 @@ TABLE1_DATASETS = (
 )
 # Beyond the paper's only_forward, two datasets whose demonstrations of one behaviour cover more of the maze.
 ROBUSTNESS_DATASETS = ("medium_maze-only_forward", "medium_maze-one_side", "medium_maze-spread_out")
+CONTRACTING_DATASETS = (
+    "medium_maze-only_forward",
+    "medium_maze-spread_out",
+    "d3il_avoiding",
+    "d3il_aligning",
+)
 CONTROL_DATASETS = ("medium_maze-only_fast",)
 FIGURES_DATASETS = ("medium_maze-only_forward",)
 DATASETS = {
     "table1": TABLE1_DATASETS,
     "robustness": ROBUSTNESS_DATASETS,
+    "contracting": CONTRACTING_DATASETS,
     "control": CONTROL_DATASETS,
     "figures": FIGURES_DATASETS,
 }
+
+Conditions = dict[str, tuple[dict[str, Any], tuple[str, ...]]]
+"""Name to the options of the environment and the ways of drawing styles."""
+
+BOTH_PROTOCOLS = ("uniform", "stratified")
 
 # --- Robustness (the paper's Table 2) ---
 CONDITIONS: dict[str, dict[str, Any]] = {
@@ -42,6 +54,14 @@ NOISE_LEVELS = (0.5, 1.0, 1.5, 2.0)
 ROBUST_WZBC: tuple[dict[str, Any], ...] = ({"p": 0.95}, {"beta": 3.0})
 ROBUST_WZBC_DATASETS = ("medium_maze-spread_out",)
 
+# --- Contracting styles: beyond the paper, docs/contracting.md ---
+UNPERTURBED = "deterministic"
+STICKY_WALLS: dict[str, dict[str, Any]] = {
+    "sticky walls": {"sticky_walls": True},
+    "sticky walls, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
+}
+CORRECTIVE = ("noise", "demos")
+
 # --- Control ---
 LENGTH_BAND = (70, 80)
 
@@ -55,8 +75,14 @@ PAPER_BETA, PAPER_P = 10.0, 0.8
 
 def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[Demonstrations]) -> list[Cell]:
     """The cells of a suite on some datasets, those that depend on a training after it."""
-    build = {"table1": _table1, "robustness": _robustness, "control": _control, "figures": _figures}[suite]
-    cells = [cell for demos in datasets for cell in build(settings, demos)]
+    build = {
+        "table1": _table1,
+        "robustness": _robustness,
+        "contracting": _contracting,
+        "control": _control,
+        "figures": _figures,
+    }
+    cells = [cell for demos in datasets for cell in build[suite](settings, demos)]
     return list(dict.fromkeys(cell for one in cells for cell in (one.needs, one) if cell is not None))
 
 
@@ -73,19 +99,55 @@ def _robustness(settings: ReproductionSettings, demos: Demonstrations) -> Iterab
     if "wzbc" in settings.choose_policies(STACKED):
         trained |= {training(settings, demos, "wzbc", options): False for options in variants}
     for one, in_table1 in trained.items():
-        for name, env in CONDITIONS.items():
-            paths = in_table1 and name == "deterministic"  # the same cell
-            yield evaluation(settings, demos, one, name, env, paths=paths)
-        for radius in START_RADII:
-            env = {"start": "pseudo_random", "start_radius": radius}
-            if env != CONDITIONS["pseudo-random start"]:
-                yield evaluation(settings, demos, one, f"start radius {radius:g}", env, ("stratified",))
-        for level in NOISE_LEVELS:
-            env = {"transition_noise": level}
-            if env != CONDITIONS["transition noise"]:
-                yield evaluation(settings, demos, one, f"noise {level:g}", env, ("stratified",))
+        for name, (env, protocols) in _maze_conditions().items():
+            paths = in_table1 and name == UNPERTURBED  # the same cell
+            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
     values = [{"beta": PAPER_BETA, "p": PAPER_P, **options} for options in ({}, *variants)]
     yield _similarity(demos, (), [(v["beta"], v["p"]) for v in values])
+
+
+def _maze_conditions() -> Conditions:
+    """The paper's conditions, drawn both ways, and the other points of the curves."""
+    curves: dict[str, dict[str, Any]] = {
+        **{f"start radius {r:g}": {"start": "pseudo_random", "start_radius": r} for r in START_RADII},
+        **{f"noise {level:g}": {"transition_noise": level} for level in NOISE_LEVELS},
+    }
+    conditions = {name: (env, BOTH_PROTOCOLS) for name, env in CONDITIONS.items()}
+    known = list(CONDITIONS.values())
+    return {**conditions, **_stratified({name: env for name, env in curves.items() if env not in known})}
+
+
+def _stratified(conditions: Mapping[str, dict[str, Any]]) -> Conditions:
+    return {name: (env, ("stratified",)) for name, env in conditions.items()}
+
+
+def perturbations(demos: Demonstrations) -> Conditions:
+    """The conditions of the suite ``contracting``, the environment as it is first.
+
+    Raises:
+        ValueError: If the dataset's environment has none.
+    """
+    if demos.env["type"] == "maze2d":
+        return {**_maze_conditions(), **_stratified(STICKY_WALLS)}
+    offered = environment(demos.env).perturbations()
+    if not offered:
+        raise ValueError(f"datasets: {demos.name!r}: its environment names no perturbations")
+    return {UNPERTURBED: ({}, BOTH_PROTOCOLS), **_stratified(offered)}
+
+
+def _contracting(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
+    chosen = settings.choose_policies(("zbc", "wzbc"))
+    if not chosen:
+        return
+    trained = {training(settings, demos, policy): True for policy in chosen}
+    if "zbc" in chosen:
+        trained |= {training(settings, demos, "zbc", {"corrective": kind}): False for kind in CORRECTIVE}
+    for one, in_table1 in trained.items():
+        for name, (env, protocols) in perturbations(demos).items():
+            paths = in_table1 and name == UNPERTURBED  # the same cell
+            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
+    for name, (env, protocols) in perturbations(demos).items():
+        yield playback(settings, demos, name, env, protocols)
 
 
 def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
