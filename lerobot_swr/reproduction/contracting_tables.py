@@ -67,7 +67,7 @@ def unperturbed(suite: SuiteResults, dataset: str) -> Table:
         f"{dataset}, without perturbation. {INTERVALS} From seeds × n on: each style once, except for L1 "
         "uniform and its floor. Length error: median difference of a rollout's length to its demonstration's "
         "in steps, over successful rollouts with the demonstrated behaviour [95 % bootstrap interval]. "
-        "The paper has no such methods to quote."
+        "What the paper has of this is quoted with the suites table1 and robustness."
     )
     return Table(caption, header, rows)
 
