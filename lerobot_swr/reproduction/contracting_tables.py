@@ -1,6 +1,7 @@
 """Tables of the suite ``contracting``: a row per condition, a column per method."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from lerobot_swr.evaluation.report import Table
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
@@ -64,8 +65,8 @@ def unperturbed(suite: SuiteResults, dataset: str) -> Table:
         "length error",
     )
     caption = (
-        f"{dataset}, without perturbation. {INTERVALS} From seeds × n on: each style once, except for L1 "
-        "uniform and its floor. Length error: median difference of a rollout's length to its demonstration's "
+        f"{dataset}, without perturbation. {INTERVALS} Each style equally often, except for L1 uniform "
+        "and its floor. Length error: median difference of a rollout's length to its demonstration's "
         "in steps, over successful rollouts with the demonstrated behaviour [95 % bootstrap interval]. "
         "What the paper has of this is quoted with the suites table1 and robustness."
     )
@@ -83,7 +84,9 @@ def by_condition(suite: SuiteResults, dataset: str) -> list[Table]:
         "median length error in steps, over successful rollouts with the demonstrated behaviour [95 % "
         "bootstrap interval]; a dash where there are none": length_error,
     }
-    return [_table(suite, dataset, what, show) for what, show in measures.items()]
+    tables = [_table(suite, dataset, what, show) for what, show in measures.items()]
+    explained = PERTURBATIONS.get(suite.datasets[dataset].env["type"], "")
+    return [replace(tables[0], caption=f"{tables[0].caption} {explained}".strip()), *tables[1:]]
 
 
 def _table(suite: SuiteResults, dataset: str, what: str, show: Callable[[Summary], str]) -> Table:
@@ -99,8 +102,7 @@ def _table(suite: SuiteResults, dataset: str, what: str, show: Callable[[Summary
         "condition\nseeds × n",
         *(f"{method.replace(' ', chr(10), 1)}\n{rollouts(c.best)}" for method, c in first.items()),
     )
-    env = suite.datasets[dataset].env["type"]
-    caption = f"{dataset}: {what}. Each style equally often. {PERTURBATIONS.get(env, '')}"
+    caption = f"{dataset}: {what}. Each style equally often."
     return Table(caption, _aligned(header), rows)
 
 

@@ -36,6 +36,8 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
     figure = Figure(figsize=(4.1 * len(measures), 3.2 * len(sizes) + 0.5), layout="constrained")
     grid = figure.subplots(len(sizes), len(measures), squeeze=False)
     for row, (x_label, size) in zip(grid, sizes.items(), strict=True):
+        ticks = sorted(_drawn(cells, size))
+        apart = 0.012 * (ticks[-1] - ticks[0])  # so that intervals stand side by side
         for axes, name in zip(row, measures, strict=True):
             for i, method in enumerate(methods):
                 points = []
@@ -45,10 +47,11 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
                         points.append((x, *y))
                 if points:
                     x_values, y_values, low, high = np.array(sorted(points)).T
+                    x_values = x_values + apart * (i - (len(methods) - 1) / 2)
                     marker = MARKERS[i % len(MARKERS)] + "-"
                     axes.plot(x_values, y_values, marker, color=f"C{i}", label=method, markersize=4)
-                    axes.fill_between(x_values, low, high, color=f"C{i}", alpha=0.13, linewidth=0)
-            axes.set(xlabel=x_label, ylabel=name, xticks=sorted(_drawn(cells, size)))
+                    axes.vlines(x_values, low, high, color=f"C{i}", linewidth=1.5, alpha=0.6)
+            axes.set(xlabel=x_label, ylabel=name, xticks=ticks)
             if name.startswith("L1"):
                 axes.set_ylim(0, 2)
             elif name in ("success", "style match"):

@@ -119,8 +119,8 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             ],
             [
                 Picture(
-                    "Success, style match and L1 over the half-width of the square of starts (top) and the "
-                    "noise on every step (bottom), each style once; shaded: 95 % intervals as in the table. "
+                    f"{name}: success, style match and L1 over the half-width of the square of starts (top) and "
+                    "the noise on every step (bottom), each style once; bars: 95 % intervals as in the table. "
                     f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
                     curves,
                 )
@@ -143,7 +143,7 @@ def _contracting(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             [
                 Picture(
                     f"{name}: success, style match and length error over the size of each perturbation, each "
-                    "style equally often; shaded: 95 % intervals as in the tables. "
+                    "style equally often; bars: 95 % intervals as in the tables. "
                     f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
                     curves,
                 )

@@ -13,7 +13,8 @@ from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval,
 NOTHING = "–"
 
 INTERVALS = (
-    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
+    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts; resampling adds noise, so near 0 "
+    "it leans upwards and may leave the mean out]. Floor: what perfect reproducers "
     "would score as the mean over as many seeds [central 95 %]; * L1 uniform lies outside of it. "
     "Success and style fidelity: over all rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
@@ -174,6 +175,7 @@ def _difference(cell: StoredCell | None, reference: StoredCell, column: int) -> 
     first, second = ([outcomes[:, column] for outcomes in c.best.outcomes] for c in (cell, reference))
     mean, interval = difference_interval(first, second)
     clear = interval.low > 0 or interval.high < 0
+    mean = round(mean, 3) + 0.0  # no -0.000
     return f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}"
 
 
