@@ -46,6 +46,8 @@ def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Seque
         axes.set(xlabel="")
         if cell is not cells[0]:
             axes.get_legend().remove()
+        if axes.get_subplotspec().colspan.start > 0:
+            axes.set_ylabel("")
     for axes in grid:
         axes.set_axis_off()
     _save(figure, path)

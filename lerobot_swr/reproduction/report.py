@@ -119,8 +119,9 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             ],
             [
                 Picture(
-                    f"{name}: success, style match and L1 over the half-width of the square of starts (top) and "
-                    "the noise on every step (bottom), each style once; bars: 95 % intervals as in the table. "
+                    f"{name}: success, style match and L1 over the half-width of the starts' square (top) "
+                    "and the noise on every step (bottom), each style once; bars: 95 % intervals as in the "
+                    "table. "
                     f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
                     curves,
                 )
