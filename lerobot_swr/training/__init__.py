@@ -5,6 +5,7 @@
 * `flat_parameters`, `traced_gradients`, `stacked_policies`: policies of one configuration trained as one.
 * `seed_runs`: runs on disk, their checkpoints, resuming.
 * `seed_training`: the loop, spread over processes.
+* `separate_training`, `memory_dataset`: other policies, in LeRobot's own loop, with their frames in memory.
 """
 
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
