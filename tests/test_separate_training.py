@@ -70,7 +70,7 @@ def test_items_are_lerobots(make_dataset, policy_type, episodes):
         assert item.keys() == expected[row].keys()
         for key, value in expected[row].items():
             if isinstance(value, torch.Tensor):
-                assert value.dtype == item[key].dtype and torch.equal(value, item[key]), (row, key)
+                torch.testing.assert_close(item[key], value, rtol=0, atol=0)  # and of the same type
             else:
                 assert value == item[key], (row, key)
 
