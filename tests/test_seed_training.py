@@ -210,7 +210,7 @@ def test_episodes_that_are_left_out_get_no_style(swr_train, small_maze, tmp_path
     ("flags", "message"),
     [
         (("--seeds=1,1",), r"seeds=\[1, 1\]"),
-        (("--policy.type=act",), "policy.type='act': this command trains bc, zbc and wzbc"),
+        (("--policy.type=act", "--dataset.streaming=true"), "dataset.streaming: not available"),
         (("--dataset.eval_split=0.2", "--eval_steps=5"), "eval_steps: not available"),
         (("--jobs=0",), "jobs=0"),
         (("--seed=7",), "seed=7: this command takes --seeds=7"),

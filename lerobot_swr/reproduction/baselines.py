@@ -13,7 +13,7 @@ from lerobot_swr.reproduction.training import STACKED
 
 @dataclass(frozen=True)
 class Baseline:
-    """A policy that ``lerobot-train`` trains one seed after the other.
+    """A policy that LeRobot's own loop trains one seed after the other.
 
     Attributes:
         options: What differs from its defaults: networks that a CPU trains, as in ``configs/``.

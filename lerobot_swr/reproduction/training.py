@@ -1,4 +1,4 @@
-"""Computes a training cell with the training commands, one ordinary LeRobot run per seed."""
+"""Computes a training cell with `lerobot-swr-train`, one ordinary LeRobot run per seed."""
 
 import os
 import shutil
@@ -11,8 +11,9 @@ from typing import Any
 import yaml
 
 from lerobot_swr.reproduction.cells import Cell, Store
+from lerobot_swr.training.memory import LARGE_PAGES
 
-STACKED = ("bc", "zbc", "wzbc")  # trained by lerobot-swr-train, all seeds at once
+STACKED = ("bc", "zbc", "wzbc")  # lerobot-swr-train trains all seeds at once, of others one after the other
 CHECKPOINTS = 10  # periodic checkpoints of a training, from which it resumes
 
 
@@ -33,13 +34,9 @@ def train(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:
     """
     definition = cell.definition
     output_dir = store.work_folder(cell) / "run"
-    if definition["policy"] in STACKED:
-        seeds = ",".join(str(seed) for seed in definition["seeds"])
-        flags = [f"--seeds={seeds}", "--jobs=1", "--resume=true"]
-        _run(_lerobot_swr_train(), cell, store, dataset, output_dir, flags, lock)
-    else:
-        for seed in definition["seeds"]:
-            _train_alone(cell, store, dataset, output_dir / f"seed_{seed}", seed, lock)
+    seeds = ",".join(str(seed) for seed in definition["seeds"])
+    flags = [f"--seeds={seeds}", "--jobs=1", "--num_workers=0", "--resume=true"]
+    _run(cell, store, dataset, output_dir, flags, lock)
     for seed in definition["seeds"]:
         _keep_the_last_checkpoint(output_dir / f"seed_{seed}")
     return {
@@ -64,24 +61,7 @@ def steps_done(cell: Cell, store: Store) -> float:
     return min(1.0, sum(saved) / (len(seeds) * cell.definition["steps"]))
 
 
-def _train_alone(cell: Cell, store: Store, dataset: Path, run: Path, seed: int, lock: int) -> None:
-    """One seed by lerobot-train."""
-    # The link is written after everything that it points to; the folder alone may be half-written.
-    last = (run / "checkpoints" / "last").resolve()
-    if last == checkpoint_folder(cell, store, seed).parent.resolve() and last.is_dir():
-        return
-    config = run / "checkpoints" / "last" / "pretrained_model" / "train_config.json"
-    executable = [str(Path(sys.executable).with_name("lerobot-train"))]
-    if config.is_file():
-        _execute([*executable, f"--config_path={config}", "--resume=true"], cell, store, lock)
-        return
-    if run.exists():  # interrupted before its first checkpoint
-        shutil.rmtree(run)
-    _run(executable, cell, store, dataset, run, [f"--seed={seed}", "--num_workers=0"], lock)
-
-
 def _run(
-    executable: Sequence[str],
     cell: Cell,
     store: Store,
     dataset: Path,
@@ -93,7 +73,7 @@ def _run(
     steps = definition["steps"]
     options = [f"--policy.{key}={_flag(value)}" for key, value in definition["options"].items()]
     command = [
-        *executable,
+        *_lerobot_swr_train(),
         f"--policy.type={definition['policy']}",
         "--policy.device=cpu",
         "--policy.push_to_hub=false",
@@ -111,12 +91,12 @@ def _run(
 
 
 def _execute(command: Sequence[str], cell: Cell, store: Store, lock: int) -> None:
-    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    settings = {**LARGE_PAGES, **os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     with store.log_path(cell).open("a") as log:
         log.write(f"$ {' '.join(command)}\n")
         log.flush()
         run = subprocess.run(
-            list(command), stdout=log, stderr=subprocess.STDOUT, env=one_thread, pass_fds=(lock,)
+            list(command), stdout=log, stderr=subprocess.STDOUT, env=settings, pass_fds=(lock,)
         )
     if run.returncode != 0:
         raise ChildProcessError(f"the training of {cell.labels} ended with status {run.returncode}")

@@ -54,26 +54,33 @@ class SeedsTrainConfig(TrainPipelineConfig):
         for key in ("jobs", "steps", "batch_size"):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
-        self._refuse_what_is_not_stacked()
+        self._refuse_what_one_run_alone_can_do()
 
-    def _refuse_what_is_not_stacked(self) -> None:
-        if not isinstance(self.policy, BCConfig):
-            kind = "a reward model" if self.policy is None else f"policy.type={self.policy.type!r}"
-            raise ValueError(f"{kind}: this command trains bc, zbc and wzbc; use lerobot-train")
+    @property
+    def is_stacked(self) -> bool:
+        """Whether the seeds are trained as one; other policies go through LeRobot's loop one by one."""
+        return isinstance(self.policy, BCConfig)
+
+    def _refuse_what_one_run_alone_can_do(self) -> None:
+        if self.policy is None:
+            raise ValueError("a reward model: this command trains policies; use lerobot-train")
         refused = {
             "dataset.streaming": self.dataset.streaming,
-            "eval_steps": self.eval_steps > 0,
-            "env": self.env is not None and self.env_eval_freq > 0,
-            "wandb.enable": self.wandb.enable,
             "policy.push_to_hub": self.policy.push_to_hub,
             "save_checkpoint_to_hub": self.save_checkpoint_to_hub,
-            "peft": self.peft is not None,
-            "sample_weighting": self.sample_weighting is not None,
             "job": self.job.is_remote,
-            "rename_map": bool(self.rename_map),
-            "policy.use_amp": self.policy.use_amp,
             "save_checkpoint=false": not self.save_checkpoint,
         }
+        if self.is_stacked:
+            refused |= {
+                "eval_steps": self.eval_steps > 0,
+                "env": self.env is not None and self.env_eval_freq > 0,
+                "wandb.enable": self.wandb.enable,
+                "peft": self.peft is not None,
+                "sample_weighting": self.sample_weighting is not None,
+                "rename_map": bool(self.rename_map),
+                "policy.use_amp": self.policy.use_amp,
+            }
         given = [key for key, is_given in refused.items() if is_given]
         if given:
             raise ValueError(

@@ -6,6 +6,9 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Parameters and the optimizer's state take several megabytes, all of which are touched in every step.
+LARGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}  # for the environment of a new process
+
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 
@@ -23,15 +26,11 @@ def keep_freed_memory() -> None:
 
 @contextmanager
 def large_pages() -> Iterator[None]:
-    """Let processes that are started meanwhile ask for large pages, unless GLIBC_TUNABLES is set already.
-
-    Parameters and the optimizer's state take several megabytes, all of which are touched in every step.
-    """
-    known = os.environ.get("GLIBC_TUNABLES")
-    if known is None:
-        os.environ["GLIBC_TUNABLES"] = "glibc.malloc.hugetlb=1"
+    """Let processes that are started meanwhile ask for large pages, unless their use is set already."""
+    new = {key: value for key, value in LARGE_PAGES.items() if key not in os.environ}
+    os.environ.update(new)
     try:
         yield
     finally:
-        if known is None:
-            os.environ.pop("GLIBC_TUNABLES", None)
+        for key in new:
+            os.environ.pop(key, None)

@@ -23,6 +23,7 @@ from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.memory import keep_freed_memory, large_pages
 from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step, point_to_last
+from lerobot_swr.training.separate_training import train_separately
 
 STEPS_AT_ONCE = 64  # whose frames and pairs are drawn together
 
@@ -47,6 +48,8 @@ def train_seeds(config: SeedsTrainConfig) -> list[Path]:
         ChildProcessError: If one of several processes failed; it has said why.
     """
     check_options(config)
+    if not config.is_stacked:
+        return train_separately(config)
     runs = {seed: config.of_seed(seed) for seed in config.seeds}
     steps = {seed: last_step(run) for seed, run in runs.items()}
     waiting = [seed for seed in config.seeds if steps[seed] < config.steps]

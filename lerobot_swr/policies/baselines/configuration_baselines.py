@@ -5,6 +5,7 @@ Defaults are those of the D3IL benchmark's agents (Jia et al., ICLR 2024), with 
 """
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
 
@@ -18,6 +19,15 @@ class WindowDiffusionConfig(StateConfig):
 
     Args of `StateConfig` apply; every other field is documented where it is defined.
     """
+
+    # Fields that count something, of which there must be one at least.
+    counts: ClassVar[tuple[str, ...]] = (
+        "n_obs_steps",
+        "dim_model",
+        "n_heads",
+        "denoising_steps",
+        "noise_draws",
+    )
 
     # --- Window ---
     # Observations that the policy sees: the current one and those before it.
@@ -56,7 +66,7 @@ class WindowDiffusionConfig(StateConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
-        self.check_at_least_one("n_obs_steps", "dim_model", "n_heads", "denoising_steps", "noise_draws")
+        self.check_at_least_one(*self.counts)
         if self.dim_model % self.n_heads or self.dim_model % 2:
             raise ValueError(
                 f"dim_model={self.dim_model}: expected an even multiple of n_heads={self.n_heads}"
@@ -81,24 +91,21 @@ class WindowDiffusionConfig(StateConfig):
 class DdpmGptConfig(WindowDiffusionConfig):
     """DDPM-GPT: a causal transformer denoises the actions of the whole window (Pearce et al., ICLR 2023)."""
 
+    counts: ClassVar[tuple[str, ...]] = (*WindowDiffusionConfig.counts, "n_layers")
+
     # Number of transformer layers.
     n_layers: int = 4
-
-    @tells_bad_values
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: Naming the offending key and value.
-        """
-        super().__post_init__()
-        self.check_at_least_one("n_layers")
 
 
 @PreTrainedConfig.register_subclass("ddpm_act")
 @dataclass
 class DdpmActConfig(WindowDiffusionConfig):
     """DDPM-ACT: an encoder-decoder denoises a chunk of actions, which is executed (Chi et al., RSS 2023)."""
+
+    counts: ClassVar[tuple[str, ...]] = (
+        *WindowDiffusionConfig.counts,
+        *("chunk_size", "n_encoder_layers", "n_decoder_layers"),
+    )
 
     dim_model: int = 64
     attention_dropout: float = 0.1
@@ -109,16 +116,6 @@ class DdpmActConfig(WindowDiffusionConfig):
     n_encoder_layers: int = 2
     # Layers of the decoder of actions.
     n_decoder_layers: int = 4
-
-    @tells_bad_values
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises:
-            ValueError: Naming the offending key and value.
-        """
-        super().__post_init__()
-        self.check_at_least_one("chunk_size", "n_encoder_layers", "n_decoder_layers")
 
     @property
     def action_delta_indices(self) -> list[int]:

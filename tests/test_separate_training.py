@@ -1,0 +1,166 @@
+"""``lerobot-swr-train`` for policies that LeRobot's own loop trains, on frames in memory."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import train_flags
+from lerobot.datasets import LeRobotDataset
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies.factory import make_policy_config
+from safetensors.torch import load_file
+from torch.utils.data import DataLoader
+
+from lerobot_swr.cli import train as train_command
+from lerobot_swr.training.memory_dataset import MemoryDataset
+
+SMALL = {
+    "beso": ("--policy.dim_model=16", "--policy.n_heads=2"),
+    "diffusion": ("--policy.down_dims=[16,32]", "--policy.n_groups=4", "--policy.horizon=8"),
+}
+
+
+@pytest.fixture
+def swr_train(run_command):
+    """Runs ``lerobot-swr-train`` in this process."""
+
+    def run(*flags: str) -> None:
+        run_command(train_command.main, *flags)
+
+    return run
+
+
+@pytest.fixture
+def make_dataset(small_maze, small_maze_meta):
+    """LeRobot's dataset with the windows of a policy."""
+
+    def make(policy_type: str, episodes: list[int] | None) -> LeRobotDataset:
+        config = make_policy_config(policy_type, device="cpu")
+        windows = resolve_delta_timestamps(config, small_maze_meta)
+        return LeRobotDataset(
+            "local/small_maze", root=small_maze, episodes=episodes, delta_timestamps=windows
+        )
+
+    return make
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Weights and the optimizer's state of two checkpoints are equal, bit for bit."""
+    for name in ("pretrained_model/model", "training_state/optimizer_state"):
+        expected, found = (load_file(folder / f"{name}.safetensors") for folder in (one, other))
+        assert expected.keys() == found.keys()
+        for key, value in expected.items():
+            assert torch.equal(value, found[key]), (name, key)
+
+
+@pytest.mark.parametrize("episodes", [None, [1, 4, 5]])
+@pytest.mark.parametrize("policy_type", ["ddpm_act", "beso", "diffusion", "wzbc"])
+def test_items_are_lerobots(make_dataset, policy_type, episodes):
+    """Every item, key by key: values, types, windows at both ends of an episode, padding, task."""
+    expected = make_dataset(policy_type, episodes)
+    found = MemoryDataset(expected)
+    assert len(found) == len(expected) == found.num_frames
+    for row, item in enumerate(found.__getitems__(list(range(len(found))))):
+        assert item.keys() == expected[row].keys()
+        for key, value in expected[row].items():
+            if isinstance(value, torch.Tensor):
+                torch.testing.assert_close(item[key], value, rtol=0, atol=0)  # and of the same type
+            else:
+                assert value == item[key], (row, key)
+
+
+def test_batches_are_lerobots(make_dataset):
+    """PyTorch's loader makes the same batches of both."""
+    dataset = make_dataset("beso", None)
+    batches = zip(DataLoader(dataset, 16), DataLoader(MemoryDataset(dataset), 16), strict=True)
+    for expected, found in batches:
+        assert expected.keys() == found.keys()
+        for key, value in expected.items():
+            same = torch.equal(value, found[key]) if isinstance(value, torch.Tensor) else value == found[key]
+            assert same, key
+
+
+def test_images_are_refused(tmp_path):
+    """They do not fit into memory; the message says what to use."""
+    features = {"observation.images.top": {"dtype": "image", "shape": (8, 8, 3), "names": ["h", "w", "c"]}}
+    dataset = LeRobotDataset.create("local/seen", 10, features, root=tmp_path / "seen", use_videos=False)
+    for _ in range(2):
+        dataset.add_frame({"observation.images.top": np.zeros((8, 8, 3), np.uint8), "task": "look"})
+    dataset.save_episode()
+    dataset.finalize()
+    with pytest.raises(ValueError, match=r"observation.images.top, which do not fit .* use lerobot-train"):
+        MemoryDataset(LeRobotDataset("local/seen", root=tmp_path / "seen"))
+
+
+@pytest.mark.parametrize("policy_type", SMALL)
+def test_a_seed_is_trained_as_lerobot_train_does(
+    lerobot_train_command, swr_train, small_maze, tmp_path, policy_type
+):
+    """Bit for bit, over more than an epoch."""
+    flags = [*SMALL[policy_type], "--dataset.episodes=[0,4]", "--log_freq=5"]
+    common = (policy_type, small_maze)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)  # another number would round otherwise
+    lerobot_train_command(*train_flags(*common, tmp_path / "one", 20, *flags, "--seed=3"))
+    torch.set_num_threads(threads)
+    swr_train(*train_flags(*common, tmp_path / "all", 20, *flags, "--seeds=3", "--jobs=1"))
+    last = Path("checkpoints") / "last"
+    assert_same_run(tmp_path / "one" / last, tmp_path / "all" / "seed_3" / last)
+
+
+def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path):
+    """kill -9 in the middle, then --resume=true: every seed ends as in an uninterrupted run."""
+    flags = [*SMALL["beso"], "--save_freq=20", "--seeds=0,1", "--jobs=2"]
+    steps = 200
+    swr_train(*train_flags("beso", small_maze, tmp_path / "whole", steps, *flags))
+    killed = train_flags("beso", small_maze, tmp_path / "killed", steps, *flags)
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from lerobot_swr.cli.train import main; main()", *killed],
+        env={**os.environ, "HF_HUB_OFFLINE": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    while not (tmp_path / "killed/seed_1/checkpoints/000040").is_dir():
+        assert process.poll() is None
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    for child in children:
+        while Path(f"/proc/{child}").is_dir():  # ends by itself, or the test's time limit tells
+            time.sleep(0.05)
+    assert not (tmp_path / "killed/seed_1/checkpoints/000200").is_dir()
+    swr_train(*killed, "--resume=true")
+    for seed in range(2):
+        last = Path(f"seed_{seed}/checkpoints/000200")
+        assert_same_run(tmp_path / "whole" / last, tmp_path / "killed" / last)
+
+
+def test_finished_seeds_are_left_alone_and_half_written_ones_start_anew(swr_train, small_maze, tmp_path):
+    """A checkpoint without LeRobot's link to it was not complete."""
+    flags = train_flags("beso", small_maze, tmp_path / "run", 4, *SMALL["beso"], "--jobs=1")
+    swr_train(*flags, "--seeds=0,1")
+    files = [
+        tmp_path / f"run/seed_{seed}/checkpoints/000004/pretrained_model/model.safetensors" for seed in (0, 1)
+    ]
+    before = [file.stat().st_mtime_ns for file in files]
+    expected = load_file(files[1])
+    (tmp_path / "run/seed_1/checkpoints/last").unlink()
+    files[1].write_bytes(b"half")
+    swr_train(*flags, "--seeds=0,1", "--resume=true")
+    assert files[0].stat().st_mtime_ns == before[0]
+    assert all(torch.equal(value, expected[key]) for key, value in load_file(files[1]).items())
+
+
+def test_an_error_in_training_is_explained(swr_train, small_maze, tmp_path, capfd):
+    """What LeRobot's loop refuses in its own process, the command prints."""
+    flags = train_flags("beso", small_maze, tmp_path / "run", 4, *SMALL["beso"], "--seeds=0")
+    with pytest.raises(SystemExit):
+        swr_train(*flags, "--dataset.eval_split=1")
+    assert "leaves 0 training episodes" in capfd.readouterr().err
