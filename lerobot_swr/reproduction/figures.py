@@ -171,7 +171,8 @@ def plot_sweep(path: Path, cells: Sequence[StoredCell]) -> None:
         chosen.sort(key=lambda pair: pair[0])
         _draw_sweep(axes, [str(f"{x:g}") for x, _ in chosen], [cell for _, cell in chosen])
         symbols = {"beta": "β", "p": "p"}
-        axes.set(xlabel=f"{symbols[name]} ({symbols[other]} = {fixed:g})", ylim=(0, 1.25))
+        axes.set_xlabel(f"{symbols[name]} ({symbols[other]} = {fixed:g})")
+        axes.set_ylim(bottom=0)
     _save(figure, path)
 
 
