@@ -96,24 +96,52 @@ def test_without_corrective_labels_nothing_is_added(small_maze, policy_type):
 
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
 @pytest.mark.parametrize("kind", ["noise", "demos"])
-def test_half_of_the_frames_are_corrective_and_under_their_own_style(small_maze, policy_type, kind):
-    """They have their episode's style and weight; the others stay what they are without corrective labels."""
+def test_half_of_the_frames_are_corrective(small_maze, policy_type, kind):
+    """They are no frames of the batch; the others stay what they are without corrective labels."""
     policy, meta = make(small_maze, policy_type, corrective=kind)
     plain, _ = make(small_maze, policy_type)
     batch = batch_of(policy, meta, every_frame(policy))
     drawn, expected = policy.draw(batch), plain.draw(batch)
     corrective = drawn["corrective"]
-    assert abs(corrective.float().mean() - 0.5) < 0.1
+    assert int(corrective.sum()) == len(corrective) // 2
     for key, value in expected.items():
         assert torch.equal(drawn[key][~corrective], value[~corrective]), key
-    assert torch.equal(drawn["style_episode"][corrective], batch["episode_index"][corrective])
-    torch.testing.assert_close(
-        drawn["weight"][corrective], policy.frame_weights(batch["episode_index"])[corrective]
-    )
+        assert drawn[key].dtype == value.dtype, key  # float32: not every device has float64
+    styles = drawn["style_episode"][corrective]
+    torch.testing.assert_close(drawn["weight"][corrective], policy.frame_weights(styles))
+    assert set(styles.tolist()) == set(range(6))
     if policy_type == "wzbc":
         assert not drawn["relabelled"][corrective].any()
         assert drawn["relabelled"].any()
     assert ((drawn[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
+
+
+def test_corrective_frames_teach_the_style_of_their_demonstration(small_maze):
+    """With almost no noise every one is a frame of the episode whose style it teaches, with its action."""
+    policy, meta = make(small_maze, corrective="noise", corrective_scale=1e-7)
+    rows = every_frame(policy)
+    batch = batch_of(policy, meta, rows)
+    drawn = policy.draw(batch)
+    demonstrated = batch_of(policy, meta, rows.sort().values)
+    for place in drawn["corrective"].nonzero().squeeze(1).tolist():
+        own = demonstrated["episode_index"] == drawn["style_episode"][place]
+        distances = (demonstrated[STATE][own] - drawn[STATE][place]).norm(dim=1)
+        assert distances.min() < 1e-4
+        torch.testing.assert_close(
+            drawn[ACTION][place], demonstrated[ACTION][own][distances.argmin()], atol=1e-3, rtol=0
+        )
+
+
+def test_the_larger_half_of_odd_batches_takes_turns(small_maze):
+    """Batches of one frame are corrective every other time, whether drawn singly or together."""
+    policy, meta = make(small_maze, corrective="noise")
+    policy.draw(batch_of(policy, meta, every_frame(policy)))
+    rows = torch.arange(10)
+    singly = [bool(policy.draw(batch_of(policy, meta, row[None]))["corrective"]) for row in rows]
+    assert sum(singly) == 5
+    assert singly == singly[:2] * 5
+    together = policy.draw(batch_of(policy, meta, rows), steps=10)["corrective"]
+    assert together.tolist() == singly
 
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "IDENTITY"])
@@ -121,30 +149,41 @@ def test_corrective_frames_are_normalised_as_lerobot_normalises(small_maze, mode
     """Raw labels through LeRobot's own preprocessor are what the policy draws, under every normalisation."""
     mapping = dict.fromkeys(("STATE", "ENV", "ACTION"), mode)
     policy, meta = make(small_maze, corrective="noise", normalization_mapping=mapping)
-    batch = batch_of(policy, meta, every_frame(policy))
-    corrections = copy.deepcopy(policy.corrections)
-    drawn = policy.draw(batch)
-    n, per_frame = len(batch["index"]), corrections.labels.draws_per_frame
-    uniforms = torch.from_numpy(corrections.draws.uniforms(1, n * per_frame)).view(n, per_frame)
-    raw = corrections.labels.relabel(batch["index"], uniforms, torch.arange(6))
+    corrections = policy.corrections
+    drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
+    n, per_frame = int(drawn["corrective"].sum()), corrections.labels.draws_per_frame
+    uniforms = corrections.draws.uniforms_at(0, n, per_frame).reshape(n, per_frame)
+    raw = corrections.labels.draw(uniforms, np.arange(6))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
-    expected = preprocessor({**raw.observations, ACTION: raw.actions})
+    expected = {**raw.observations, ACTION: raw.actions}
+    expected = preprocessor({key: torch.from_numpy(value) for key, value in expected.items()})
     for key in (STATE, ENV, ACTION):
-        torch.testing.assert_close(drawn[key][raw.places], expected[key], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(drawn[key][drawn["corrective"]], expected[key], atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("size", [16, 5])
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
-def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type):
-    """From the first step on, when partners are still few, and later."""
+def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type, size):
+    """From the first step on, when partners are still few, and later; bit for bit."""
     one, meta = make(small_maze, policy_type, corrective="demos")
     many = copy.deepcopy(one)
-    rows = every_frame(one)[:160].view(10, 16)
+    rows = every_frame(one)[: 10 * size].view(10, size)
     for part in (rows[:6], rows[6:]):
         singly = [one.draw(batch_of(one, meta, step)) for step in part]
         at_once = many.draw(batch_of(many, meta, part.flatten()), len(part))
-        for key in ("style_episode", "weight", STATE, ACTION):
-            together = torch.cat([drawn[key] for drawn in singly])
-            torch.testing.assert_close(at_once[key], together, atol=1e-5, rtol=1e-5)
+        for key in ("style_episode", "weight", "corrective", STATE, ACTION):
+            assert torch.equal(at_once[key], torch.cat([drawn[key] for drawn in singly])), key
+
+
+def test_corrective_frames_do_not_depend_on_how_many_are_drawn_together(small_maze, monkeypatch):
+    """Blocks bound the memory; they do not change what is drawn."""
+    drawn = []
+    for block in (256, 7):
+        monkeypatch.setattr("lerobot_swr.policies.corrections.BLOCK", block)
+        policy, meta = make(small_maze, corrective="demos")
+        drawn.append(policy.draw(batch_of(policy, meta, every_frame(policy))))
+    for key in ("style_episode", STATE, ACTION):
+        torch.testing.assert_close(drawn[0][key], drawn[1][key], atol=1e-5, rtol=1e-5)
 
 
 def test_pairs_and_corrective_draws_are_independent(small_maze):

@@ -8,6 +8,7 @@ it is that it needs no demonstrations when it acts.
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
@@ -56,7 +57,7 @@ class PlaybackPolicy(nn.Module):
         self.feedback = Feedback(trajectories, fit_inverse_model(trajectories))
         self.styles = StyleCookbook(len(trajectories), 0, 0.0, style_sampling)
         self.styles.trained.fill_(1)
-        self._matched: Tensor | None = None
+        self._matched: np.ndarray | None = None
 
     def reset(self) -> None:
         """Start a rollout: the next action draws one demonstration per environment."""
@@ -69,15 +70,16 @@ class PlaybackPolicy(nn.Module):
 
         The frame is looked for in the whole demonstration at first, then near the last one.
         """
-        states = batch[OBS_STATE].float()
+        given = batch[OBS_STATE]
+        states = given.cpu().numpy().astype(np.float32)
         self.styles.active_styles(len(states))
         assert self.styles.active is not None
         paths = self.feedback.paths
         if self._matched is None:
-            self._matched = paths.nearest_of_episode(states, self.styles.active)
+            self._matched = paths.nearest_of_episode(states, self.styles.active.cpu().numpy())
         else:
             self._matched = paths.nearest(states, self._matched)
-        return self.feedback.act(states, self._matched)
+        return torch.from_numpy(self.feedback.act(states, self._matched)).to(given.device)
 
 
 def playback_checkpoint(trajectories: Trajectories, style_sampling: StyleSampling = "uniform") -> Checkpoint:

@@ -8,7 +8,6 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
-from lerobot_swr.corrective.labels import SHARE
 from lerobot_swr.policies.configuration_swr import WZBCConfig
 from lerobot_swr.policies.zbc_policy import ZBCPolicy
 from lerobot_swr.sampling import SimilarityWeightedSampler, StepGenerator
@@ -100,7 +99,7 @@ class WZBCPolicy(ZBCPolicy):
         relabelled = drawn["relabelled"].cpu().numpy()
         own, share = ~relabelled, float(len(values))
         if "corrective" in drawn:
-            own, share = own & ~drawn["corrective"].cpu().numpy(), share * (1 - SHARE)
+            own, share = own & ~drawn["corrective"].cpu().numpy(), share / 2
         if p < 1:
             figures["own_style_loss"] = float(values @ own) / share / (1 - p)
         if p > 0:

@@ -12,10 +12,9 @@ from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
-from lerobot_swr.corrective.inverse_model import InverseModel
 from lerobot_swr.policies.bc_policy import BCPolicy
 from lerobot_swr.policies.configuration_swr import ZBCConfig
-from lerobot_swr.policies.corrections import Corrections, describe_dynamics
+from lerobot_swr.policies.corrections import Corrections, Dynamics, describe_dynamics
 from lerobot_swr.policies.held_out_styles import HeldOutStyles
 from lerobot_swr.similarity import cached_distances
 from lerobot_swr.style_selection import StyleSelection
@@ -39,7 +38,7 @@ class ZBCPolicy(BCPolicy):
     config_class = ZBCConfig
     name = "zbc"
     config: ZBCConfig
-    _dynamics: InverseModel | None = None
+    _dynamics: Dynamics | None = None
 
     def __init__(self, config: ZBCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config, dataset_meta, **kwargs)
@@ -61,7 +60,7 @@ class ZBCPolicy(BCPolicy):
             self.corrections = Corrections(config)
         if self.corrections is not None and self._dynamics is not None:
             stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
-            self.corrections.adopt_dataset(config, self.trajectories, stats, self._dynamics)
+            self.corrections.adopt_dataset(config, self._dynamics, stats, self._episode_weights)
         if dataset_meta is not None:
             self.styles.table = self._make_table(dataset_meta)
 
@@ -93,17 +92,10 @@ class ZBCPolicy(BCPolicy):
             parts = [self.draw(one) for one in split]
             return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         self.styles.mark_trained(episodes)
-        frames = super().draw(batch, steps)
-        drawn = self._with_styles(frames, episodes, steps)
+        drawn = self._with_styles(super().draw(batch, steps), episodes, steps)
         if self.corrections is None:
             return drawn
-        own = {
-            "weight": frames["weight"],
-            "style_episode": episodes,
-            "relabelled": torch.zeros_like(episodes),
-        }
-        trained = self.styles.trained[: self.config.num_episodes]
-        return self.corrections.correct(drawn, own, batch["index"], trained, steps)
+        return self.corrections.correct(drawn, self.styles.trained[: self.config.num_episodes], steps)
 
     def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
         """What `draw` returns, given what `BCPolicy.draw` did: every frame teaches its own style."""
@@ -166,11 +158,11 @@ class ZBCPolicy(BCPolicy):
     # --- Checkpoints ---
 
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
+        from_checkpoint = self.config.dataset_fingerprint is not None
         super()._adopt_dataset(meta)
         if self._new_dataset:
             self.config.num_added_styles = 0
-        if self.config.corrective != "none":
-            self._dynamics = describe_dynamics(self.config, meta, self.trajectories)
+        self._dynamics = describe_dynamics(self.config, meta, self.trajectories, from_checkpoint)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
