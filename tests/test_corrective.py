@@ -105,6 +105,26 @@ def test_what_cannot_work_is_refused(maze):
         fit_inverse_model(maze, horizon=500)
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_few_episodes_are_enough(maze, count):
+    """Every episode is held out once; the gain is that of the maze."""
+    model = fit_inverse_model(maze.subset(range(count)), 1)
+    np.testing.assert_allclose(np.diag(model.gain), -1 / MAX_STEP, rtol=0.15)
+    assert (model.r2 > 0.9).all()
+
+
+def test_episodes_shorter_than_the_horizon_hold_nothing_out(maze):
+    """A single long episode leaves no frames to fit when it is held out: shorter horizons, or the reason."""
+    one_step = [(maze.episode(i)[STATE][:2], maze.episode(i)[ACTION][:2]) for i in range(1, 4)]
+    few = make_trajectories([(maze.episode(0)[STATE], maze.episode(0)[ACTION]), *one_step])
+    assert fit_inverse_model(few).horizon == 1
+    with pytest.raises(ValueError, match=r"fewer than 2 of its 4 episodes.*horizon of 2.*a smaller"):
+        fit_inverse_model(few, horizon=2)
+    single_frames = make_trajectories([(states[:1], actions[:1]) for states, actions in one_step])
+    with pytest.raises(ValueError, match=r"fewer than 2 of its 3 episodes.*corrective=none"):
+        fit_inverse_model(single_frames)
+
+
 def test_a_large_dataset_is_fitted_on_evenly_chosen_episodes(maze, monkeypatch):
     """The cost of the fit stays bounded; the gain stays what it is."""
     monkeypatch.setattr("lerobot_swr.corrective.inverse_model.MAX_FRAMES", 800)

@@ -211,7 +211,17 @@ class ZBCPolicy(BCPolicy):
             self.styles.table.save(Path(save_directory))
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """On another dataset keep the network and start new styles."""
+        """On another dataset keep the network and start new styles.
+
+        Raises:
+            ValueError: If corrective labels are asked of a checkpoint that was trained without, to act.
+        """
+        corrective = self.config.corrective
+        if self._dataset_meta is None and corrective != "none" and "corrections.draws.seed" not in state:
+            raise ValueError(
+                f"policy.corrective={corrective!r}: this checkpoint was trained without corrective labels, "
+                "which take effect in training alone; leave the flag out, or train with it"
+            )
         state = super()._translate_checkpoint(state)
         if self.corrections is not None and self._dynamics is not None:
             state = {**state, **self.corrections.fitted("corrections.")}
