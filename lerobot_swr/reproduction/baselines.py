@@ -63,9 +63,9 @@ BASELINES = {
         steps="diffusion_steps",
         extra="lerobot[diffusion]",
     ),
-    "beso": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
-    "ddpm_gpt": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
-    "ddpm_act": Baseline({"lr_schedule": "cosine", "noise_draws": 4}, batch_size=16),
+    "beso": Baseline({"lr_schedule": "cosine"}, batch_size=64),
+    "ddpm_gpt": Baseline({"lr_schedule": "cosine"}, batch_size=64),
+    "ddpm_act": Baseline({"lr_schedule": "cosine"}, batch_size=64),
 }
 
 

@@ -21,13 +21,7 @@ class WindowDiffusionConfig(StateConfig):
     """
 
     # Fields that count something, of which there must be one at least.
-    counts: ClassVar[tuple[str, ...]] = (
-        "n_obs_steps",
-        "dim_model",
-        "n_heads",
-        "denoising_steps",
-        "noise_draws",
-    )
+    counts: ClassVar[tuple[str, ...]] = ("n_obs_steps", "dim_model", "n_heads", "denoising_steps")
 
     # --- Window ---
     # Observations that the policy sees: the current one and those before it.
@@ -54,9 +48,6 @@ class WindowDiffusionConfig(StateConfig):
     lr_schedule: str = "constant"
     # Decay of the moving average of the weights, which is what acts.
     ema_decay: float = 0.995
-    # How often each window of a batch is noised, to another level each time. LeRobot takes longer to load a
-    # window than the network to learn from it, so a few draws are almost free; the benchmark draws once.
-    noise_draws: int = 1
 
     @tells_bad_values
     def __post_init__(self) -> None:

@@ -113,17 +113,13 @@ class WindowDiffusionPolicy(StatePolicy):
         Returns:
             The loss, scalar or (B,), and no further figures. Steps beyond the episode add nothing to it.
         """
-        draws = self.config.noise_draws  # R
-        observations, actions, is_pad, action_is_pad = (
-            x.repeat_interleave(draws, dim=0)
-            for x in (self.encoder(batch), batch[ACTION], batch[PAD], batch[ACTION_PAD])
-        )
+        actions = batch[ACTION]
         with self._own_draws(actions.device):
             noised: Noised = self.process.noised(actions)
             network = self.network if self.training else self.average
-            predicted = network(observations, noised.inputs, noised.level, is_pad)
-        errors = (predicted - noised.target).square().mean(dim=-1)  # (B R, K)
-        losses = (errors * ~action_is_pad).reshape(len(batch[ACTION]), -1).mean(dim=-1)
+            predicted = network(self.encoder(batch), noised.inputs, noised.level, batch[PAD])
+        errors = (predicted - noised.target).square().mean(dim=-1)  # (B, K)
+        losses = (errors * ~batch[ACTION_PAD]).mean(dim=-1)
         return (losses if reduction == "none" else losses.mean()), {}
 
     @contextmanager
