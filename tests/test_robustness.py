@@ -110,13 +110,17 @@ def test_an_interrupted_evaluation_keeps_what_it_has(run_command, small_maze, tm
     assert [path.name for path in tmp_path.iterdir()] == ["robustness.json"]
 
 
-def test_only_the_given_episodes_are_played_and_compared_with(run_command, small_maze, tmp_path):
+def test_only_the_given_episodes_are_played_and_compared_with(
+    run_command, small_maze, demonstrations, tmp_path
+):
     """--dataset.episodes: no other demonstration is known to the baseline, nor in the histogram."""
+    shown = [Maze2DEnvConfig(task="small").behavior_rule()(episode) for episode in demonstrations.episodes()]
+    chosen = [shown.index("10"), shown.index("20")]
     flags = ("--baseline=playback", "--n_episodes=8", f"--dataset.root={small_maze}", *ENV)
-    more = ("--dataset.episodes=[0,5]", "--style_sampling=stratified")
+    more = (f"--dataset.episodes={chosen}", "--style_sampling=stratified")
     run_command(eval_command.main, *flags, *more, f"--output_dir={tmp_path}")
     result = json.loads((tmp_path / "behaviors.json").read_text())
-    assert sorted(episode["style_episode"] for episode in result["episodes"]) == [0] * 4 + [5] * 4
+    assert sorted(episode["style_episode"] for episode in result["episodes"]) == sorted(chosen * 4)
     assert result["reference_histogram"] == {"10": 0.5, "20": 0.5}
     assert (result["style_fidelity"], result["l1"]) == (1, 0)
     run_command(eval_command.main, *flags, *more, "--robustness=true", f"--output_dir={tmp_path}")
@@ -146,7 +150,7 @@ def test_playback_of_some_demonstrations_is_that_of_a_dataset_of_them(demonstrat
         (("--counterfactual=3", "--dataset.episodes=[1]", *ENV), ("--counterfactual", "--dataset.episodes")),
         (("--blend=3", "--style_sampling=fixed", *ENV), ("--blend", "--style_sampling")),
         (("--style_sampling=fixed", "--policy.style_sampling=uniform", *ENV), ("--policy.style_sampling",)),
-        (("--baseline=playback", "--policy.device=cpu", *ENV), ("--baseline", "--policy.*")),
+        (("--baseline=playback", "--policy.type=zbc", *ENV), ("--baseline", "--policy.*")),
         (("--robustness=true",), ("--robustness", "--env.type")),
         (("--counterfactual=3", "--behavior_rule=a:b"), ("--counterfactual, --behavior_rule", "--env.type")),
     ],

@@ -143,7 +143,7 @@ class EvalCommand:
             "rename_map": bool(self.rename_map),
             "baseline": self.baseline is not None,
             "policy.style_sampling": any(o.startswith("--style_sampling") for o in _policy_overrides()),
-            "policy.*": bool(_policy_overrides()),
+            "policy.*": self.policy is not None or bool(_policy_overrides()),
         }
         for first, others in CONFLICTS.items():
             for second in others:
