@@ -368,10 +368,10 @@ def test_relative_actions_of_a_state_that_never_changes():
 # --- Episodes that are left out ---
 
 
-@pytest.mark.parametrize("way", ["flag", "file"])
-def test_episodes_left_out_shape_nothing(small_maze, tmp_path, monkeypatch, way):
+@pytest.mark.parametrize(("way", "balanced"), [("flag", True), ("file", False)])
+def test_episodes_left_out_shape_nothing(small_maze, tmp_path, monkeypatch, way, balanced):
     """J, R², ranges and limits are those of a dataset that never had the other episodes."""
-    chosen = [0, 2, 3, 4]
+    chosen = [0, 2, 3, 5]
     if way == "flag":
         argv = ["lerobot-train", f"--dataset.episodes={chosen}"]
     else:
@@ -379,7 +379,7 @@ def test_episodes_left_out_shape_nothing(small_maze, tmp_path, monkeypatch, way)
         file.write_text(json.dumps({"dataset": {"episodes": chosen}}))
         argv = ["lerobot-train", f"--config_path={file}"]
     monkeypatch.setattr("sys.argv", argv)
-    policy, _ = make(small_maze, corrective="demos")
+    policy, _ = make(small_maze, corrective="demos", balance_episodes=balanced)
     subset = policy.trajectories.subset(chosen)
     model = fit_inverse_model(subset)
     assert policy.config.inverse_r2 == pytest.approx(model.r2, abs=1e-4)
@@ -389,7 +389,9 @@ def test_episodes_left_out_shape_nothing(small_maze, tmp_path, monkeypatch, way)
     # Styles keep their episodes' numbers, also if a checkpoint was trained on others before.
     policy.styles.trained.fill_(1)
     drawn = policy.draw(batch_of(policy, policy._dataset_meta, torch.zeros(400, dtype=torch.int64)))
-    assert set(drawn["style_episode"][drawn["corrective"]].tolist()) == set(chosen)
+    styles = drawn["style_episode"][drawn["corrective"]]
+    assert set(styles.tolist()) == set(chosen)
+    torch.testing.assert_close(drawn["weight"][drawn["corrective"]], policy.frame_weights(styles))
 
 
 @pytest.mark.parametrize(

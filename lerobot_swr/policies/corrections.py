@@ -162,7 +162,7 @@ class Corrections(nn.Module):
                 config.observation_keys,
             )
             self._episodes = dynamics.episodes
-            self._weights = np.ones(len(trajectories)) if weights is None else weights.cpu().numpy()
+            self._weights = None if weights is None else weights.cpu().numpy()
 
     def correct(self, drawn: dict[str, Tensor], trained: Tensor, steps: int) -> dict[str, Tensor]:
         """Put corrective frames in the place of the first half of every step's frames.
@@ -239,7 +239,8 @@ class Corrections(nn.Module):
         raw = {**frames.observations, ACTION: frames.actions}
         episodes = self._episodes[frames.episodes]
         content = {key: self._units[key].normalize(value) for key, value in raw.items()}
-        content |= {"weight": self._weights[episodes].astype(np.float32), "style_episode": episodes}
+        weights = np.ones(BLOCK, np.float32) if self._weights is None else self._weights[episodes]
+        content |= {"weight": weights, "style_episode": episodes}
         return self.encode({key: torch.from_numpy(value).to(device) for key, value in content.items()})
 
     def encode(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
