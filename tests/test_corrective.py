@@ -359,6 +359,20 @@ def test_noise_is_log_uniform_up_to_the_scale(maze):
     assert np.abs(offsets.mean(axis=0)).max() < 0.003
 
 
+def test_noise_leads_as_far_whatever_the_number_of_dimensions(maze):
+    """A state of eight dimensions, each coordinate four times: the norm's mean square is that of two."""
+    means = []
+    for copies in (1, 4):
+        columns = {STATE: np.tile(maze.columns[STATE], (1, copies)), ACTION: maze.columns[ACTION]}
+        wide = Trajectories(maze.lengths, columns, maze.fps, maze.name)
+        labels = CorrectiveLabels(wide, fit_inverse_model(wide), "noise", 0.1, [STATE])
+        uniforms = np.random.default_rng(0).random((40_000, labels.draws_per_frame))
+        uniforms[:, 0] = 0.0  # the first frame
+        offsets = labels.draw(uniforms, np.arange(30)).observations[STATE] - columns[STATE][0]
+        means.append(np.square(offsets / np.ptp(columns[STATE], axis=0)).sum(axis=1).mean())
+    assert means[1] == pytest.approx(means[0], rel=0.05)
+
+
 def test_without_partners_frames_stay_as_they_are(maze):
     """A single candidate: demos gives its own frames with the demonstrated actions."""
     labels = CorrectiveLabels(maze, fit_inverse_model(maze), "demos", 0.1, [STATE])

@@ -39,7 +39,8 @@ class CorrectiveLabels:
     ``noise`` takes the state of a frame with Gaussian noise, whose standard deviation is log-uniform between
     a tenth of `scale` and `scale`; ``demos`` a state of another demonstration, near ones more often: c, the
     distance of its future, has the weight exp(−c / scale). Only ``observation.state`` differs from a
-    demonstrated frame: it is what actions move.
+    demonstrated frame: it is what actions move. Where more than two of its dimensions change, d, `scale` is
+    multiplied by √(2 / d): noise then leads as far from the path whatever d is.
 
     A pure function of uniform numbers that the caller draws. NumPy, and many frames at once: for so few
     numbers most of the time is the overhead of each operation.
@@ -48,7 +49,7 @@ class CorrectiveLabels:
         trajectories: The dataset, with all observations that a policy sees.
         model: Its inverse model.
         kind: ``noise`` or ``demos``.
-        scale: In units of each state dimension's range.
+        scale: In units of each state dimension's range, for a state of two dimensions.
         observation_keys: Features that a policy sees.
     """
 
@@ -60,8 +61,10 @@ class CorrectiveLabels:
         scale: float,
         observation_keys: list[str],
     ):
-        self.kind, self.scale = kind, scale
+        self.kind = kind
         self.feedback = Feedback(trajectories, model)
+        dimensions = int((self.feedback.paths.range > 0).sum())
+        self.scale = scale * min(1.0, (2 / max(dimensions, 1)) ** 0.5)
         self._others = {k: trajectories.columns[k] for k in observation_keys if k != OBS_STATE}
 
     @property
