@@ -21,7 +21,7 @@ def pooled(values: list[float], counts: list[int]) -> str:
 
 
 def main() -> None:
-    """One table each for success, style match and length error: rows perturbations, columns policies."""
+    """One table each for success, style match, length error and L1: rows perturbations, columns policies."""
     policies = {}
     for argument in sys.argv[1:]:
         name, _, pattern = argument.partition("=")
@@ -29,7 +29,7 @@ def main() -> None:
         policies[name] = [json.loads(file.read_text())["cells"] for file in files]
         if not files:
             sys.exit(f"{argument!r}: no such file")
-    for key in ("success_rate", "style_match", "length_error"):
+    for key in ("success_rate", "style_match", "length_error", "l1"):
         print(f"\n| {key} | {' | '.join(f'{name} ({len(seeds)})' for name, seeds in policies.items())} |")
         print("|---" * (len(policies) + 1) + "|")
         for place, cell in enumerate(next(iter(policies.values()))[0]):
@@ -41,6 +41,9 @@ def main() -> None:
                     row.append("-")
                 elif key == "length_error":
                     row.append(f"{np.mean(values):.1f}")
+                elif key == "l1":
+                    floor = np.mean([cells[place]["l1_floor"] for cells in seeds])
+                    row.append(f"{np.mean(values):.2f} (floor {floor:.2f})")
                 else:
                     row.append(pooled(values, counts))
             print(f"| {' | '.join(row)} |")

@@ -1,6 +1,7 @@
 """How configurations of this package meet LeRobot's parser: refusing bad values, telling a resumed run."""
 
 import functools
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -8,8 +9,11 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+import yaml
 from huggingface_hub import constants
 from lerobot.configs import parser
+from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.datasets import LeRobotDatasetMetadata
 
 
 def tells_bad_values(post_init: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -43,6 +47,38 @@ def check_dataset_folder() -> None:
             f"dataset.root={root!r}: no such folder, and HF_HUB_OFFLINE is set, so it cannot be downloaded; "
             "check the path, or make the dataset (lerobot-swr-dataset)"
         )
+
+
+def training_episodes(meta: LeRobotDatasetMetadata) -> list[int] | None:
+    """The episodes of a dataset that the running command trains on; None for all.
+
+    LeRobot creates a policy with the metadata of the whole dataset. What ``--dataset.episodes`` and
+    ``--dataset.eval_split`` leave is therefore read from the command line and its configuration file.
+
+    Args:
+        meta: Metadata of the training dataset.
+    """
+    episodes, share = _dataset_option("episodes"), _dataset_option("eval_split") or 0.0
+    if not share:
+        return episodes
+    by_task: dict[str, list[int]] = {}
+    for episode in range(meta.total_episodes) if episodes is None else episodes:
+        by_task.setdefault((meta.episodes[episode]["tasks"] or [""])[0], []).append(episode)
+    # Source: lerobot.datasets.factory.make_train_eval_datasets
+    return [i for group in by_task.values() for i in group[: len(group) - math.ceil(len(group) * share)]]
+
+
+def _dataset_option(key: str) -> Any:
+    """Value of ``--dataset.<key>``, from the command line or else the file at ``--config_path``."""
+    given = parser.parse_arg(f"dataset.{key}")
+    if given is not None:
+        return yaml.safe_load(given)
+    file = Path(parser.parse_arg("config_path") or "")
+    if file.is_dir():
+        file = file / TRAIN_CONFIG_NAME
+    if not file.is_file():
+        return None
+    return (yaml.safe_load(file.read_text()).get("dataset") or {}).get(key)  # JSON is YAML, too
 
 
 _resuming: ContextVar[bool | None] = ContextVar("resuming", default=None)

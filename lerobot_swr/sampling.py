@@ -12,7 +12,7 @@ from lerobot_swr.similarity import Normalization, check_beta, check_normalizatio
 PartnerSampling = Literal["uniform", "weighted"]
 
 MAX_INSPECTED_STYLES = 64
-STEPS_PER_BLOCK = 256  # whose random numbers are drawn together
+NUMBERS_PER_BLOCK = 2**14  # random numbers that are drawn together: many cost little more than a few
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,7 @@ class StepGenerator(nn.Module):
     def __init__(self, stream: int = 0) -> None:
         super().__init__()
         self._stream = stream
-        self._blocks: dict[int, tuple[tuple[int, ...], np.ndarray]] = {}  # by count of numbers per step
+        self._drawn: tuple[tuple[int, ...], np.ndarray] | None = None  # the last block
         self.seed: Tensor
         self.step: Tensor
         self.register_buffer("seed", torch.tensor(torch.initial_seed() % 2**63))
@@ -197,31 +197,34 @@ class StepGenerator(nn.Module):
     def next(self) -> torch.Generator:
         """A generator for the next step, on the CPU."""
         entropy = self._entropy(int(self.step))
-        self.step += 1
+        self.step.add_(1)
         seed = np.random.SeedSequence(entropy).generate_state(1, np.uint32)[0]
         return torch.Generator().manual_seed(int(seed))
 
     def uniforms(self, steps: int, count: int) -> np.ndarray:
         """(steps * count,) float64 numbers in [0, 1), `count` for each of the next steps."""
         first = int(self.step)
-        self.step += steps
+        self.step.add_(steps)
+        return self.uniforms_at(first, steps, count)
+
+    def uniforms_at(self, first: int, steps: int, count: int) -> np.ndarray:
+        """The numbers of `uniforms` for steps `first` to `first` + `steps` - 1, whichever is the next one."""
+        per_block = max(1, NUMBERS_PER_BLOCK // count)  # steps
         parts = []
         while steps > 0:
-            place = first % STEPS_PER_BLOCK
-            parts.append(self._block(first // STEPS_PER_BLOCK, count)[place : place + steps])
+            block, place = divmod(first, per_block)
+            parts.append(self._block(block, per_block, count)[place : place + steps])
             first, steps = first + len(parts[-1]), steps - len(parts[-1])
         return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(-1)
 
-    def _block(self, block: int, count: int) -> np.ndarray:
-        """(STEPS_PER_BLOCK, count) numbers of consecutive steps; drawn together they cost little more."""
-        entropy = self._entropy(block)
-        known = self._blocks.get(count)
-        if known is None or known[0] != entropy:
-            generator = np.random.default_rng([*entropy, count])
+    def _block(self, block: int, steps: int, count: int) -> np.ndarray:
+        """(steps, count) numbers of consecutive steps."""
+        entropy = (*self._entropy(block), count)
+        if self._drawn is None or self._drawn[0] != entropy:
+            numbers = np.random.default_rng(entropy).random((steps, count))
             # A little below 1, lest a product with such a number be rounded up to its other factor.
-            known = (entropy, np.minimum(generator.random((STEPS_PER_BLOCK, count)), 1 - 1e-9))
-            self._blocks = {**{k: v for k, v in self._blocks.items() if v[0] == entropy}, count: known}
-        return known[1]
+            self._drawn = (entropy, np.minimum(numbers, 1 - 1e-9))
+        return self._drawn[1]
 
     def _entropy(self, place: int) -> tuple[int, ...]:
         distributed = torch.distributed.is_available() and torch.distributed.is_initialized()

@@ -13,7 +13,7 @@ from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP
 from lerobot_swr.trajectories import Trajectories
 
-STATE, ACTION = "observation.state", "action"
+STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 
 
 def make_trajectories(episodes: list[tuple[np.ndarray, np.ndarray]], **columns: np.ndarray) -> Trajectories:
@@ -105,6 +105,26 @@ def test_what_cannot_work_is_refused(maze):
         fit_inverse_model(maze, horizon=500)
 
 
+@pytest.mark.parametrize("count", [2, 3, 4, 5])
+def test_few_episodes_are_enough(maze, count):
+    """Every episode is held out once; the gain is that of the maze."""
+    model = fit_inverse_model(maze.subset(range(count)), 1)
+    np.testing.assert_allclose(np.diag(model.gain), -1 / MAX_STEP, rtol=0.15)
+    assert (model.r2 > 0.9).all()
+
+
+def test_episodes_shorter_than_the_horizon_hold_nothing_out(maze):
+    """A single long episode leaves no frames to fit when it is held out: shorter horizons, or the reason."""
+    one_step = [(maze.episode(i)[STATE][:2], maze.episode(i)[ACTION][:2]) for i in range(1, 4)]
+    few = make_trajectories([(maze.episode(0)[STATE], maze.episode(0)[ACTION]), *one_step])
+    assert fit_inverse_model(few).horizon == 1
+    with pytest.raises(ValueError, match=r"fewer than 2 of its 4 episodes.*horizon of 2.*a smaller"):
+        fit_inverse_model(few, horizon=2)
+    single_frames = make_trajectories([(states[:1], actions[:1]) for states, actions in one_step])
+    with pytest.raises(ValueError, match=r"fewer than 2 of its 3 episodes.*corrective=none"):
+        fit_inverse_model(single_frames)
+
+
 def test_a_large_dataset_is_fitted_on_evenly_chosen_episodes(maze, monkeypatch):
     """The cost of the fit stays bounded; the gain stays what it is."""
     monkeypatch.setattr("lerobot_swr.corrective.inverse_model.MAX_FRAMES", 800)
@@ -120,12 +140,12 @@ def test_relative_actions_are_standardised_and_translate_back():
     states = rng.normal(5, 2, (500, 3)).astype(np.float32)
     actions = np.stack([states[:, 1] + rng.normal(0.3, 0.01, 500), rng.normal(size=500)], axis=1)
     actions = actions.astype(np.float32)
-    state = Units(torch.tensor([0.5, 2.0, 1.0]), torch.tensor([-2.0, 1.0, 0.0]))
-    action = Units(torch.tensor([4.0, 3.0]), torch.tensor([-7.0, 0.5]))
+    state = Units(np.array([0.5, 2.0, 1.0]), np.array([-2.0, 1.0, 0.0]))
+    action = Units(np.array([4.0, 3.0]), np.array([-7.0, 0.5]))
     relative = RelativeActions(2, 3)
     relative.fit(states, actions, np.array([1, -1]), state, action)
-    normalized_states = state.normalize(torch.from_numpy(states))
-    normalized = action.normalize(torch.from_numpy(actions))
+    normalized_states = torch.from_numpy(state.normalize(states))
+    normalized = torch.from_numpy(action.normalize(actions))
     encoded = relative.encode(normalized, normalized_states)
     assert abs(float(encoded[:, 0].mean())) < 1e-2
     assert float(encoded[:, 0].std()) == pytest.approx(1, rel=1e-2)
@@ -143,9 +163,7 @@ def test_the_nearest_frame_in_the_window_is_found(maze):
     rows = rng.integers(0, len(maze.columns[STATE]), 60)
     states = maze.columns[STATE][rows] + rng.normal(0, 0.1, (60, 2)).astype(np.float32)
     scale = np.ptp(maze.columns[STATE], axis=0)
-    for state, row, found in zip(
-        states, rows, paths.nearest(torch.from_numpy(states), torch.from_numpy(rows)).tolist(), strict=True
-    ):
+    for state, row, found in zip(states, rows, paths.nearest(states, rows), strict=True):
         episode = int(np.searchsorted(maze.starts, row, side="right") - 1)
         first = max(maze.starts[episode], row - paths.window)
         last = min(maze.starts[episode] + maze.lengths[episode] - 1, row + paths.window)
@@ -157,11 +175,11 @@ def test_constant_dimensions_do_not_count(maze):
     """A dimension that never changes alters neither distances nor, by its zero range, anything else."""
     constant = np.full((len(maze.columns[STATE]), 1), 3.0, np.float32)
     wider = np.concatenate([maze.columns[STATE], constant], axis=1)
-    rows = torch.arange(0, 2000, 50)
+    rows = np.arange(0, 2000, 50)
     plain, wide = (DemonstratedPaths(s, maze.lengths) for s in (maze.columns[STATE], wider))
     shifted = plain.states[rows] + 0.05
-    found = wide.nearest(torch.cat([shifted, torch.zeros(len(rows), 1)], dim=1), rows)
-    assert torch.equal(found, plain.nearest(shifted, rows))
+    found = wide.nearest(np.concatenate([shifted, np.zeros((len(rows), 1))], axis=1), rows)
+    np.testing.assert_array_equal(found, plain.nearest(shifted, rows))
 
 
 def slow_cost(paths: DemonstratedPaths, trajectories: Trajectories, row: int, episode: int) -> float:
@@ -171,7 +189,7 @@ def slow_cost(paths: DemonstratedPaths, trajectories: Trajectories, row: int, ep
     last = trajectories.starts[own] + trajectories.lengths[own] - 1
     other = trajectories.episode(episode)[STATE]
     nearest = []
-    for offset in paths._future.tolist():
+    for offset in paths.future:
         state = trajectories.columns[STATE][min(row + offset, last)]
         nearest.append(np.sqrt(np.square((other - state) / scale).mean(axis=1)).min())
     return float(np.mean(nearest))
@@ -184,10 +202,8 @@ def test_partners_are_drawn_by_their_cost(maze):
     small = make_trajectories(short)
     paths = DemonstratedPaths(small.columns[STATE], small.lengths)
     draws, bandwidth = 20_000, 0.2
-    uniforms = torch.rand(draws, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0))
-    rows, matched = paths.draw_partners(
-        torch.zeros(draws, dtype=torch.int64), torch.arange(3), bandwidth, uniforms.double()
-    )
+    uniforms = np.random.default_rng(0).random((draws, 2 * CANDIDATES + 1))
+    rows, matched = paths.draw_partners(np.zeros(draws, dtype=int), np.arange(3), bandwidth, uniforms)
     others = np.arange(4, 12)
     costs = np.array([slow_cost(paths, small, row, 0) for row in others])
     rng = np.random.default_rng(1)
@@ -204,13 +220,13 @@ def test_partners_are_drawn_by_their_cost(maze):
 def test_only_candidates_become_partners(maze):
     """Episodes outside of training lend no frame."""
     paths = DemonstratedPaths(maze.columns[STATE], maze.lengths)
-    candidates = torch.tensor([1, 4, 9, 20])
-    own = candidates[torch.arange(400) % 4]
-    uniforms = torch.rand(400, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0)).double()
+    candidates = np.array([1, 4, 9, 20])
+    own = candidates[np.arange(400) % 4]
+    uniforms = np.random.default_rng(0).random((400, 2 * CANDIDATES + 1))
     rows, matched = paths.draw_partners(own, candidates, 0.1, uniforms)
     assert set(paths.episode[rows].tolist()) == set(candidates.tolist())
     assert (paths.episode[rows] != own).all()
-    assert torch.equal(paths.episode[matched], own)
+    np.testing.assert_array_equal(paths.episode[matched], own)
 
 
 def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
@@ -220,9 +236,9 @@ def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
     episodes = [(way + 0.001 * rng.standard_normal(way.shape), np.gradient(way[:, 0])[:, None])] * 6
     trajectories = make_trajectories(episodes)
     paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
-    uniforms = torch.rand(500, 2 * CANDIDATES + 1, generator=torch.Generator().manual_seed(0)).double()
-    rows, matched = paths.draw_partners(torch.zeros(500, dtype=torch.int64), torch.arange(6), 0.1, uniforms)
-    away_from_the_turn = (paths.phase[rows] - 0.5).abs() > 0.3
+    uniforms = np.random.default_rng(0).random((500, 2 * CANDIDATES + 1))
+    rows, matched = paths.draw_partners(np.zeros(500, dtype=int), np.arange(6), 0.1, uniforms)
+    away_from_the_turn = np.abs(paths.phase[rows] - 0.5) > 0.3
     assert away_from_the_turn.sum() > 100
     same_way = (paths.phase[rows] > 0.5) == (paths.phase[matched] > 0.5)
     assert same_way[away_from_the_turn].all()
@@ -238,25 +254,26 @@ def test_dimensions_without_a_model_keep_the_demonstrated_action(maze):
     with_gripper = Trajectories(maze.lengths, {**maze.columns, ACTION: actions}, maze.fps, maze.name)
     feedback = Feedback(with_gripper, fit_inverse_model(with_gripper))
     assert feedback.corrected.tolist() == [True, True, False]
-    rows = torch.arange(0, len(actions), 10)
+    rows = np.arange(0, len(actions), 10)
     acted = feedback.act(feedback.paths.states[rows] + 0.3, rows)
-    assert torch.equal(acted[:, 2], torch.from_numpy(actions)[rows, 2])
-    assert (acted[:, :2].abs() <= feedback.limits[:2] * (1 + 1e-6)).all()
+    np.testing.assert_array_equal(acted[:, 2], actions[rows, 2])
+    assert (np.abs(acted[:, :2]) <= feedback.limits[:2] * (1 + 1e-6)).all()
 
 
 def test_the_limiter_scales_and_never_turns_an_action(maze):
     """Actions keep their direction, end within ± the largest demonstrated magnitude, and small ones stay."""
     feedback = Feedback(maze, fit_inverse_model(maze))
     limits = np.abs(maze.columns[ACTION]).max(axis=0)
-    actions = torch.randn(300, 2, generator=torch.Generator().manual_seed(0)) * 2
+    actions = np.random.default_rng(0).normal(0, 2, (300, 2))
     limited = feedback.limit(actions)
-    assert (limited.abs().numpy() <= limits * (1 + 1e-6)).all()
-    torch.testing.assert_close(torch.nn.functional.normalize(limited), torch.nn.functional.normalize(actions))
-    small = (actions.abs().numpy() <= limits).all(axis=1)
-    assert torch.equal(limited[small], actions[small])
-    assert (limited[~small].abs().numpy() >= limits * (1 - 1e-6)).any(axis=1).all()
+    assert (np.abs(limited) <= limits * (1 + 1e-6)).all()
+    directions = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (limited, actions))
+    np.testing.assert_allclose(*directions, rtol=1e-5)
+    small = (np.abs(actions) <= limits).all(axis=1)
+    np.testing.assert_array_equal(limited[small], actions[small])
+    assert (np.abs(limited[~small]) >= limits * (1 - 1e-6)).any(axis=1).all()
     assert (limited < 0).any()  # backwards, although no demonstration moves backwards
-    assert feedback.limit(torch.zeros(1, 2)).tolist() == [[0, 0]]
+    assert feedback.limit(np.zeros((1, 2))).tolist() == [[0, 0]]
 
 
 def test_a_target_is_limited_relative_to_the_state():
@@ -264,96 +281,97 @@ def test_a_target_is_limited_relative_to_the_state():
     trajectories = servo(4)
     feedback = Feedback(trajectories, fit_inverse_model(trajectories))
     lead = np.abs(trajectories.columns[ACTION] - trajectories.columns[STATE][:, ::-1]).max(axis=0)
-    rows = torch.tensor([40, 200, 700])
-    states = feedback.paths.states[rows] + torch.tensor([5.0, 0, 0])
-    moved = feedback.act(states, rows) - states.flip(1)
-    assert (moved.abs().numpy() <= lead * (1 + 1e-4)).all()
+    rows = np.array([40, 200, 700])
+    states = feedback.paths.states[rows] + np.array([5.0, 0, 0])
+    moved = feedback.act(states, rows) - states[:, ::-1]
+    assert (np.abs(moved) <= lead * (1 + 1e-4)).all()
     assert (moved[:, 2] < 0).all()  # joint 0 is the target of dimension 2
 
 
 def test_labels_beside_the_path_lead_back_to_it(maze):
     """In the known dynamics, following the labels shrinks the distance to the path threefold in 8 steps."""
     feedback = Feedback(maze, fit_inverse_model(maze))
-    rows = torch.from_numpy(maze.starts + 20)
-    offsets = torch.randn(len(rows), 2, generator=torch.Generator().manual_seed(0)) * 0.05
+    rows = maze.starts + 20
+    offsets = np.random.default_rng(0).normal(0, 0.05, (len(rows), 2))
+
+    def distance(states: np.ndarray, matched: np.ndarray) -> float:
+        nearest = feedback.paths.states[feedback.paths.nearest(states, matched)]
+        return float(np.linalg.norm(states - nearest, axis=1).mean())
+
     states, matched = feedback.paths.states[rows] + offsets, rows
-    before = (states - feedback.paths.states[feedback.paths.nearest(states, matched)]).norm(dim=1)
+    before = distance(states, matched)
     for _ in range(8):
         matched = feedback.paths.nearest(states, matched)
-        states = states + MAX_STEP * feedback.act(states, matched).clamp(-1, 1)
-    after = (states - feedback.paths.states[feedback.paths.nearest(states, matched)]).norm(dim=1)
-    assert after.mean() < before.mean() / 3
-    assert (feedback.paths.phase[matched] > feedback.paths.phase[rows]).float().mean() > 0.9
+        states = states + MAX_STEP * np.clip(feedback.act(states, matched), -1, 1)
+    assert distance(states, matched) < before / 3
+    assert (feedback.paths.phase[matched] > feedback.paths.phase[rows]).mean() > 0.9
 
 
 @pytest.mark.parametrize("kind", ["noise", "demos"])
 def test_labels_are_the_formula_at_the_matched_frame(maze, kind):
-    """a' = limit(a_u + J (x - s_u)), recomputed in NumPy; what actions do not move comes from frame u."""
-    n = len(maze.columns[STATE])
-    clock = np.arange(n, dtype=np.float32)[:, None]
-    trajectories = Trajectories(
-        maze.lengths, {**maze.columns, "observation.environment_state": clock}, 10, "t"
-    )
+    """a' = limit(a_u + J (x - s_u)), recomputed in float64; what actions do not move comes from frame u."""
+    clock = np.arange(len(maze.columns[STATE]), dtype=np.float32)[:, None]
+    trajectories = Trajectories(maze.lengths, {**maze.columns, ENV: clock}, 10, "t")
     model = fit_inverse_model(trajectories)
-    keys = [STATE, "observation.environment_state"]
-    labels = CorrectiveLabels(trajectories, model, kind, 0.1, keys)
-    generator = torch.Generator().manual_seed(0)
-    rows = torch.randint(n, (400,), generator=generator)
-    uniforms = torch.rand(400, labels.draws_per_frame, generator=generator, dtype=torch.float64)
-    found = labels.relabel(rows, uniforms, torch.arange(len(trajectories)))
-    assert found.places.tolist() == np.flatnonzero(uniforms[:, 0] < 0.5).tolist()
+    labels = CorrectiveLabels(trajectories, model, kind, 0.1, [STATE, ENV])
+    uniforms = np.random.default_rng(0).random((400, labels.draws_per_frame))
+    found = labels.draw(uniforms, np.arange(len(trajectories)))
 
-    u = found.observations["observation.environment_state"][:, 0].long().numpy()
-    states = found.observations[STATE].numpy()
-    episode = np.searchsorted(maze.starts, rows[found.places].numpy(), side="right") - 1
-    assert (np.searchsorted(maze.starts, u, side="right") - 1 == episode).all()
-    expected = maze.columns[ACTION][u] + (states - maze.columns[STATE][u]) @ model.gain.T
+    u = found.observations[ENV][:, 0].astype(int)
+    states = found.observations[STATE]
+    np.testing.assert_array_equal(np.searchsorted(maze.starts, u, side="right") - 1, found.episodes)
+    expected = maze.columns[ACTION][u] + (states - maze.columns[STATE][u]).astype(float) @ model.gain.T
     limits = np.abs(maze.columns[ACTION]).max(axis=0)
     expected /= np.maximum(np.abs(expected / limits).max(axis=1), 1)[:, None]
     np.testing.assert_allclose(found.actions, expected, atol=2e-5)
+    demonstrated = {tuple(s): i for i, s in enumerate(maze.columns[STATE])}
     if kind == "demos":
-        demonstrated = {tuple(s) for s in maze.columns[STATE]}
-        assert all(tuple(s) in demonstrated for s in states)
+        owners = np.searchsorted(maze.starts, [demonstrated[tuple(s)] for s in states], side="right") - 1
+        assert (owners != found.episodes).all()
+    else:
+        assert not any(tuple(s) in demonstrated for s in states)
+
+
+def test_every_frame_of_the_candidates_is_drawn_alike(maze):
+    """Counts of demonstrated frames, recognised where the noise is almost none: uniform over all rows."""
+    labels = CorrectiveLabels(maze, fit_inverse_model(maze), "noise", 1e-7, [STATE])
+    candidates = np.array([2, 3, 11])
+    found = labels.draw(np.random.default_rng(0).random((60_000, 4)), candidates)
+    lengths = maze.lengths[candidates]
+    shares = np.bincount(found.episodes, minlength=len(maze))[candidates] / 60_000
+    np.testing.assert_allclose(shares, lengths / lengths.sum(), atol=0.01)
+    progress = labels.feedback.paths.phase[
+        labels.feedback.paths.nearest_of_episode(found.observations[STATE][:2000], found.episodes[:2000])
+    ]
+    assert abs(progress.mean() - 0.5) < 0.03
+    assert abs(progress.std() - 12**-0.5) < 0.03
 
 
 def test_noise_is_log_uniform_up_to_the_scale(maze):
     """Standard deviations between a tenth of the scale and the scale, in units of each dimension's range."""
     labels = CorrectiveLabels(maze, fit_inverse_model(maze), "noise", 0.2, [STATE])
-    n = 40_000
-    rows = torch.full((n,), 500)
-    uniforms = torch.rand(n, labels.draws_per_frame, generator=torch.Generator().manual_seed(0)).double()
-    found = labels.relabel(rows, uniforms, torch.arange(30)).observations[STATE].numpy()
-    offsets = (found - maze.columns[STATE][500]) / np.ptp(maze.columns[STATE], axis=0)
+    uniforms = np.random.default_rng(0).random((40_000, labels.draws_per_frame))
+    uniforms[:, 0] = 0.0  # the first frame
+    found = labels.draw(uniforms, np.arange(30)).observations[STATE]
+    offsets = (found - maze.columns[STATE][0]) / np.ptp(maze.columns[STATE], axis=0)
     # E[σ²] of a log-uniform σ in [0.02, 0.2] is (0.2² - 0.02²) / (2 ln 10)
     assert np.square(offsets).mean(axis=0) == pytest.approx((0.2**2 - 0.02**2) / (2 * np.log(10)), rel=0.05)
     assert np.abs(offsets.mean(axis=0)).max() < 0.003
 
 
-@pytest.mark.parametrize("kind", ["noise", "demos"])
-def test_labels_of_many_frames_at_once_are_those_of_a_few(maze, kind, monkeypatch):
-    """Batches may be split and joined at will, and memory is bounded by chunks."""
-    labels = CorrectiveLabels(maze, fit_inverse_model(maze), kind, 0.1, [STATE])
-    generator = torch.Generator().manual_seed(0)
-    rows = torch.randint(len(maze.columns[STATE]), (90,), generator=generator)
-    uniforms = torch.rand(90, labels.draws_per_frame, generator=generator, dtype=torch.float64)
-    candidates = torch.arange(30)
-    whole = labels.relabel(rows, uniforms, candidates)
-    monkeypatch.setattr("lerobot_swr.corrective.labels.CHUNK", 7)
-    parts = [labels.relabel(rows[i : i + 30], uniforms[i : i + 30], candidates) for i in (0, 30, 60)]
-    torch.testing.assert_close(whole.actions, torch.cat([part.actions for part in parts]))
-    torch.testing.assert_close(whole.observations[STATE], torch.cat([p.observations[STATE] for p in parts]))
-
-
 def test_without_partners_frames_stay_as_they_are(maze):
-    """A single candidate: demos replaces nothing."""
+    """A single candidate: demos gives its own frames with the demonstrated actions."""
     labels = CorrectiveLabels(maze, fit_inverse_model(maze), "demos", 0.1, [STATE])
-    found = labels.relabel(torch.arange(10), torch.zeros(10, labels.draws_per_frame), torch.tensor([0]))
-    assert len(found.places) == len(found.actions) == 0
+    found = labels.draw(np.random.default_rng(0).random((20, labels.draws_per_frame)), np.array([3]))
+    own = {tuple(s): tuple(a) for s, a in zip(*(maze.episode(3)[k] for k in (STATE, ACTION)), strict=True)}
+    for state, action in zip(found.observations[STATE], found.actions, strict=True):
+        np.testing.assert_allclose(action, own[tuple(state)], rtol=1e-6)
 
 
 def test_a_gain_of_zero_repeats_the_demonstrated_action(maze):
     """Without a gain the label is the matched frame's action."""
     model = InverseModel(3, np.zeros((2, 2)), np.zeros(2), np.full(2, -1))
     feedback = Feedback(maze, model)
-    rows = torch.tensor([5, 100])
-    torch.testing.assert_close(feedback.act(feedback.paths.states[rows] + 0.1, rows), feedback.actions[rows])
+    rows = np.array([5, 100])
+    acted = feedback.act(feedback.paths.states[rows] + 0.1, rows)
+    np.testing.assert_array_equal(acted, maze.columns[ACTION][rows])

@@ -8,13 +8,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from conftest import save_checkpoint, train_flags
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 
+from lerobot_swr.configuration import training_episodes
+from lerobot_swr.corrective.inverse_model import fit_inverse_model
+from lerobot_swr.corrective.relative_actions import RelativeActions, Units
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
@@ -96,24 +103,52 @@ def test_without_corrective_labels_nothing_is_added(small_maze, policy_type):
 
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
 @pytest.mark.parametrize("kind", ["noise", "demos"])
-def test_half_of_the_frames_are_corrective_and_under_their_own_style(small_maze, policy_type, kind):
-    """They have their episode's style and weight; the others stay what they are without corrective labels."""
+def test_half_of_the_frames_are_corrective(small_maze, policy_type, kind):
+    """They are no frames of the batch; the others stay what they are without corrective labels."""
     policy, meta = make(small_maze, policy_type, corrective=kind)
     plain, _ = make(small_maze, policy_type)
     batch = batch_of(policy, meta, every_frame(policy))
     drawn, expected = policy.draw(batch), plain.draw(batch)
     corrective = drawn["corrective"]
-    assert abs(corrective.float().mean() - 0.5) < 0.1
+    assert int(corrective.sum()) == len(corrective) // 2
     for key, value in expected.items():
         assert torch.equal(drawn[key][~corrective], value[~corrective]), key
-    assert torch.equal(drawn["style_episode"][corrective], batch["episode_index"][corrective])
-    torch.testing.assert_close(
-        drawn["weight"][corrective], policy.frame_weights(batch["episode_index"])[corrective]
-    )
+        assert drawn[key].dtype == value.dtype, key  # float32: not every device has float64
+    styles = drawn["style_episode"][corrective]
+    torch.testing.assert_close(drawn["weight"][corrective], policy.frame_weights(styles))
+    assert set(styles.tolist()) == set(range(6))
     if policy_type == "wzbc":
         assert not drawn["relabelled"][corrective].any()
         assert drawn["relabelled"].any()
     assert ((drawn[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
+
+
+def test_corrective_frames_teach_the_style_of_their_demonstration(small_maze):
+    """With almost no noise every one is a frame of the episode whose style it teaches, with its action."""
+    policy, meta = make(small_maze, corrective="noise", corrective_scale=1e-7)
+    rows = every_frame(policy)
+    batch = batch_of(policy, meta, rows)
+    drawn = policy.draw(batch)
+    demonstrated = batch_of(policy, meta, rows.sort().values)
+    for place in drawn["corrective"].nonzero().squeeze(1).tolist():
+        own = demonstrated["episode_index"] == drawn["style_episode"][place]
+        distances = (demonstrated[STATE][own] - drawn[STATE][place]).norm(dim=1)
+        assert distances.min() < 1e-4
+        torch.testing.assert_close(
+            drawn[ACTION][place], demonstrated[ACTION][own][distances.argmin()], atol=1e-3, rtol=0
+        )
+
+
+def test_the_larger_half_of_odd_batches_takes_turns(small_maze):
+    """Batches of one frame are corrective every other time, whether drawn singly or together."""
+    policy, meta = make(small_maze, corrective="noise")
+    policy.draw(batch_of(policy, meta, every_frame(policy)))
+    rows = torch.arange(10)
+    singly = [bool(policy.draw(batch_of(policy, meta, row[None]))["corrective"]) for row in rows]
+    assert sum(singly) == 5
+    assert singly == singly[:2] * 5
+    together = policy.draw(batch_of(policy, meta, rows), steps=10)["corrective"]
+    assert together.tolist() == singly
 
 
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "IDENTITY"])
@@ -121,30 +156,41 @@ def test_corrective_frames_are_normalised_as_lerobot_normalises(small_maze, mode
     """Raw labels through LeRobot's own preprocessor are what the policy draws, under every normalisation."""
     mapping = dict.fromkeys(("STATE", "ENV", "ACTION"), mode)
     policy, meta = make(small_maze, corrective="noise", normalization_mapping=mapping)
-    batch = batch_of(policy, meta, every_frame(policy))
-    corrections = copy.deepcopy(policy.corrections)
-    drawn = policy.draw(batch)
-    n, per_frame = len(batch["index"]), corrections.labels.draws_per_frame
-    uniforms = torch.from_numpy(corrections.draws.uniforms(1, n * per_frame)).view(n, per_frame)
-    raw = corrections.labels.relabel(batch["index"], uniforms, torch.arange(6))
+    corrections = policy.corrections
+    drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
+    n, per_frame = int(drawn["corrective"].sum()), corrections.labels.draws_per_frame
+    uniforms = corrections.draws.uniforms_at(0, n, per_frame).reshape(n, per_frame)
+    raw = corrections.labels.draw(uniforms, np.arange(6))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
-    expected = preprocessor({**raw.observations, ACTION: raw.actions})
+    expected = {**raw.observations, ACTION: raw.actions}
+    expected = preprocessor({key: torch.from_numpy(value) for key, value in expected.items()})
     for key in (STATE, ENV, ACTION):
-        torch.testing.assert_close(drawn[key][raw.places], expected[key], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(drawn[key][drawn["corrective"]], expected[key], atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("size", [16, 5])
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
-def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type):
-    """From the first step on, when partners are still few, and later."""
+def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type, size):
+    """From the first step on, when partners are still few, and later; bit for bit."""
     one, meta = make(small_maze, policy_type, corrective="demos")
     many = copy.deepcopy(one)
-    rows = every_frame(one)[:160].view(10, 16)
+    rows = every_frame(one)[: 10 * size].view(10, size)
     for part in (rows[:6], rows[6:]):
         singly = [one.draw(batch_of(one, meta, step)) for step in part]
         at_once = many.draw(batch_of(many, meta, part.flatten()), len(part))
-        for key in ("style_episode", "weight", STATE, ACTION):
-            together = torch.cat([drawn[key] for drawn in singly])
-            torch.testing.assert_close(at_once[key], together, atol=1e-5, rtol=1e-5)
+        for key in ("style_episode", "weight", "corrective", STATE, ACTION):
+            assert torch.equal(at_once[key], torch.cat([drawn[key] for drawn in singly])), key
+
+
+def test_corrective_frames_do_not_depend_on_how_many_are_drawn_together(small_maze, monkeypatch):
+    """Blocks bound the memory; they do not change what is drawn."""
+    drawn = []
+    for block in (256, 7):
+        monkeypatch.setattr("lerobot_swr.policies.corrections.BLOCK", block)
+        policy, meta = make(small_maze, corrective="demos")
+        drawn.append(policy.draw(batch_of(policy, meta, every_frame(policy))))
+    for key in ("style_episode", STATE, ACTION):
+        torch.testing.assert_close(drawn[0][key], drawn[1][key], atol=1e-5, rtol=1e-5)
 
 
 def test_pairs_and_corrective_draws_are_independent(small_maze):
@@ -241,7 +287,136 @@ def test_relative_actions_can_be_switched_off_and_horizons_set(servo_dataset):
     assert policy.corrections.relative is None
 
 
+# --- Fine-tuning: what outputs mean ---
+
+
+def fine_tune(policy, meta, folder: Path, root: Path, **options):
+    """A policy that starts from another one's checkpoint, as LeRobot's factory makes it."""
+    config = PreTrainedConfig.from_pretrained(save_checkpoint(policy, meta, folder))
+    config.pretrained_path = folder
+    for key, value in options.items():
+        setattr(config, key, value)
+    new_meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    return make_policy(config, ds_meta=new_meta).train(), new_meta
+
+
+def test_a_plain_checkpoint_keeps_predicting_actions(servo_dataset, tmp_path, caplog):
+    """Corrective labels on absolute targets, from a network of absolute actions: it stays one."""
+    plain, meta = make(servo_dataset)
+    tuned, _ = fine_tune(plain, meta, tmp_path, servo_dataset, corrective="noise")
+    assert tuned.config.action_targets is None
+    assert "keeps the checkpoint's outputs, actions, although" in caplog.text
+    assert len(tuned.config.inverse_r2) == 2
+    batch = batch_of(tuned, meta, every_frame(tuned))
+    style = plain.styles.embedding(batch["episode_index"])
+    assert torch.equal(tuned.predict(batch, style), plain.predict(batch, style))
+    drawn = tuned.draw(batch)
+    own = ~drawn["corrective"]
+    assert torch.equal(drawn[ACTION][own], batch[ACTION][own])
+    # Labels lead towards the path by no more than demonstrated, as a policy's that is trained anew.
+    anew, _ = make(servo_dataset, corrective="noise")
+    anew.corrections.draws.load_state_dict(tuned.corrections.draws.state_dict())
+    tuned.corrections.draws.step.zero_()
+    anew.corrections.draws.step.zero_()
+    labels = [policy.draw(batch) for policy in (tuned, anew)]
+    decoded = anew.corrections.decode(labels[1][ACTION], labels[1])
+    torch.testing.assert_close(labels[0][ACTION], decoded, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["none", "demos"])
+def test_a_relative_checkpoint_stays_relative(servo_dataset, small_maze, tmp_path, kind):
+    """On a dataset of displacements, too; all that is stored tells of the new dataset."""
+    relative, meta = make(servo_dataset, corrective="noise")
+    tuned, new_meta = fine_tune(relative, meta, tmp_path, small_maze, corrective=kind)
+    assert tuned.config.action_targets == [0, 1]
+    if kind == "none":
+        assert (tuned.config.inverse_r2, tuned.config.inverse_horizon) == (None, None)
+    else:
+        assert tuned.config.inverse_horizon == 3
+        assert tuned.config.inverse_r2 != relative.config.inverse_r2
+    columns = tuned.trajectories.columns
+    leads = columns[ACTION] - columns[STATE]
+    batch = batch_of(tuned, new_meta, every_frame(tuned))
+    drawn = tuned.draw(batch)
+    own = ~drawn["corrective"] if kind == "demos" else torch.ones(len(batch["index"]), dtype=bool)
+    expected = ((leads - leads.mean(axis=0)) / leads.std(axis=0))[batch["index"][own]]
+    np.testing.assert_allclose(drawn[ACTION][own], expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("relative", [True, False])
+def test_a_flag_that_contradicts_the_checkpoint_is_refused(servo_dataset, tmp_path, relative):
+    """corrective_relative=true on a network of actions, =false on one of relative actions."""
+    policy, meta = make(servo_dataset, corrective="none" if relative else "noise")
+    with pytest.raises(ValueError, match=rf"corrective_relative={str(relative).lower()}: the checkpoint's"):
+        fine_tune(policy, meta, tmp_path, servo_dataset, corrective="noise", corrective_relative=relative)
+
+
+def test_relative_actions_of_a_state_that_never_changes():
+    """Fine-tuning where a joint rests: its relative action is decoded all the same."""
+    rng = np.random.default_rng(0)
+    states = np.full((50, 1), 0.7, np.float32)
+    actions = rng.normal(0.9, 0.1, (50, 1)).astype(np.float32)
+    relative = RelativeActions(1, 1)
+    action = Units(np.array([2.0]), np.array([0.3]))
+    relative.fit(states, actions, np.array([0]), Units(np.zeros(1), np.zeros(1)), action)
+    normalized = torch.from_numpy(action.normalize(actions))
+    encoded = relative.encode(normalized, torch.zeros(50, 1))
+    assert abs(float(encoded.mean())) < 1e-3
+    torch.testing.assert_close(relative.decode(encoded, torch.zeros(50, 1)), normalized)
+
+
+# --- Episodes that are left out ---
+
+
+@pytest.mark.parametrize("way", ["flag", "file"])
+def test_episodes_left_out_shape_nothing(small_maze, tmp_path, monkeypatch, way):
+    """J, R², ranges and limits are those of a dataset that never had the other episodes."""
+    chosen = [0, 2, 3, 4]
+    if way == "flag":
+        argv = ["lerobot-train", f"--dataset.episodes={chosen}"]
+    else:
+        file = tmp_path / "train_config.json"
+        file.write_text(json.dumps({"dataset": {"episodes": chosen}}))
+        argv = ["lerobot-train", f"--config_path={file}"]
+    monkeypatch.setattr("sys.argv", argv)
+    policy, _ = make(small_maze, corrective="demos")
+    subset = policy.trajectories.subset(chosen)
+    model = fit_inverse_model(subset)
+    assert policy.config.inverse_r2 == pytest.approx(model.r2, abs=1e-4)
+    feedback = policy.corrections.labels.feedback
+    np.testing.assert_array_equal(feedback.paths.range, np.ptp(subset.columns[STATE], axis=0))
+    np.testing.assert_allclose(feedback.limits, np.abs(subset.columns[ACTION]).max(axis=0))
+    # Styles keep their episodes' numbers, also if a checkpoint was trained on others before.
+    policy.styles.trained.fill_(1)
+    drawn = policy.draw(batch_of(policy, policy._dataset_meta, torch.zeros(400, dtype=torch.int64)))
+    assert set(drawn["style_episode"][drawn["corrective"]].tolist()) == set(chosen)
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [["--dataset.eval_split=0.3"], ["--dataset.episodes=[5, 1, 2, 0]", "--dataset.eval_split=0.4"], []],
+)
+def test_the_episodes_to_train_on_are_lerobots(small_maze, small_maze_meta, monkeypatch, flags):
+    """What is read from the command line beside the datasets that LeRobot makes of it."""
+    monkeypatch.setattr("sys.argv", ["lerobot-train", *flags])
+    values = {key: yaml.safe_load(value) for key, value in (f.split(".", 1)[1].split("=") for f in flags)}
+    dataset = DatasetConfig("local/small_maze", root=str(small_maze), **values)
+    config = TrainPipelineConfig(dataset, policy=make_policy_config("zbc", device="cpu", push_to_hub=False))
+    expected, _ = make_train_eval_datasets(config)
+    found = training_episodes(small_maze_meta)
+    assert (found and sorted(found)) == (expected.episodes and sorted(expected.episodes))
+
+
 # --- Refusals ---
+
+
+def test_the_flag_on_a_plain_checkpoint_is_refused(small_maze, tmp_path):
+    """At evaluation it would have no effect."""
+    policy, meta = make(small_maze)
+    config = PreTrainedConfig.from_pretrained(save_checkpoint(policy, meta, tmp_path))
+    config.pretrained_path, config.corrective = tmp_path, "demos"
+    with pytest.raises(ValueError, match=r"corrective='demos': this checkpoint was trained without"):
+        load_checkpoint(config)
 
 
 def test_actions_that_states_do_not_explain_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """Cells of the paper's experiments: identity, storage, resuming, failures."""
 
 import dataclasses
+import itertools
 import json
 import os
 import signal
@@ -19,9 +20,12 @@ from lerobot_swr.reproduction import execution, measurement
 from lerobot_swr.reproduction.baselines import BASELINES, known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
-from lerobot_swr.reproduction.execution import format_states, run_cells, run_chain, unfinished_chains
-from lerobot_swr.reproduction.settings import ReproductionSettings
-from lerobot_swr.reproduction.suites import evaluation, suite_cells, training
+from lerobot_swr.reproduction.execution import run_cells, run_chain
+from lerobot_swr.reproduction.experiments import evaluation, playback, training, variant_name
+from lerobot_swr.reproduction.measurement import environment_seed
+from lerobot_swr.reproduction.planning import format_states, format_work, unfinished_chains
+from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
+from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.reproduction.training import checkpoint_folder
 
 CONFIGS = Path(__file__).parent.parent / "configs"
@@ -97,6 +101,44 @@ def test_other_demonstrations_are_a_new_cell(settings, demos):
     key = training(settings, demos, "zbc").key
     assert training(settings, other, "zbc").key != key
     assert training(settings, renamed, "zbc").key == key
+
+
+def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
+    """Defaults given or not, numbers whole or not, through the settings or a suite: one key, one name."""
+    plain = training(dataclasses.replace(settings, policy_options={}), demos, "wzbc")
+    for given in ({"beta": 10.0, "p": 0.8}, {"beta": 10}, {"p": 0.8}):
+        asked = training(dataclasses.replace(settings, policy_options={}), demos, "wzbc", given)
+        assert (asked.key, asked.slug) == (plain.key, plain.slug)
+        asked = training(dataclasses.replace(settings, policy_options=given), demos, "wzbc")
+        assert (asked.key, asked.slug) == (plain.key, plain.slug)
+    settings = dataclasses.replace(settings, sweep_steps=settings.steps, sweep_seeds=settings.seeds)
+    suites = {name: suite_cells(name, settings, [demos]) for name in ("table1", "robustness", "figures")}
+    wzbc = [
+        {cell for cell in cells if cell.kind == "train" and cell.labels.policy.startswith("wzbc")}
+        for cells in suites.values()
+    ]
+    assert len(set.intersection(*wzbc)) == 1
+    assert len(set.union(*wzbc)) == len(wzbc[2])
+
+
+def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
+    """Whole configurations are compared; every option that differs makes another cell."""
+    trained = training(settings, demos, "zbc")
+    plain = evaluation(settings, demos, trained, "x")
+    same = evaluation(settings, demos, trained, "x", {"transition_noise": 0, "start_radius": 0.10})
+    assert same.key == plain.key
+    for option in ({"transition_noise": 1.0}, {"episode_length": 150}, {"sticky_walls": True}):
+        assert evaluation(settings, demos, trained, "x", option).key != plain.key
+    assert plain.definition["env"]["episode_length"] == 200
+
+
+def test_names_tell_what_differs(settings, demos):
+    """Numbers short, words as they are; options of the settings, too."""
+    differing = {"beta": 3.0, "corrective": "demos", "residual": False, "style_dim": 4}
+    assert variant_name("wzbc", differing) == "wzbc beta=3 corrective=demos residual=False style_dim=4"
+    assert training(settings, demos, "zbc").labels.policy == "zbc hidden_dim=16"
+    both = training(settings, demos, "zbc", {"corrective": "demos"})
+    assert both.labels.policy == "zbc hidden_dim=16 corrective=demos"
 
 
 def test_a_result_appears_complete_or_not_at_all(store, monkeypatch):
@@ -183,6 +225,54 @@ def test_a_failed_cell_does_not_stop_the_others(settings, demos, store, trained,
     assert store.state(bad) == "done"
 
 
+def test_a_result_that_cannot_be_written_fails_its_cell_alone(settings, demos, store, trained, monkeypatch):
+    """A full disk at the end of a cell: it is named, the next one is computed."""
+    first = evaluation(settings, demos, trained, "deterministic")
+    second = evaluation(settings, demos, trained, "noise", {"transition_noise": 1.0})
+    write = Store.write
+
+    def full(self, one, *args):
+        if one == first:
+            raise OSError("no space left")
+        write(self, one, *args)
+
+    monkeypatch.setattr(Store, "write", full)
+    [failure] = run_cells([trained, first, second], store, {demos.name: demos}, jobs=1)
+    assert (failure.cell, "no space left" in failure.message) == (first, True)
+    assert (store.state(first), store.state(second)) == ("failed", "done")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_fails_the_cell_that_killed_it_alone(demos, store, monkeypatch):
+    """Four chains on two workers: the one that kills its process is named, the others end."""
+
+    def run_in_worker(chain, *args):
+        def compute(one, *_):
+            if one.labels.condition == "deadly":
+                os.kill(os.getpid(), signal.SIGKILL)
+            return {}
+
+        execution._compute = compute  # of the worker process
+        return run_chain(chain, *args)
+
+    names = ("harmless", "deadly", "unharmed", "unaffected")
+    cells = [Cell("similarity", Labels(demos.name, "", name), {"name": name}) for name in names]
+    monkeypatch.setattr(execution, "run_chain", run_in_worker)
+    [failure] = run_cells(cells, store, {demos.name: demos}, jobs=2)
+    assert failure.cell == cells[1]
+    assert "killed" in failure.message
+    assert [store.state(one) for one in cells] == ["done", "failed", "done", "done"]
+    assert "killed" in failure.log.read_text()
+
+
+def test_training_seeds_never_share_an_environment_seed():
+    """However many rollouts are allowed."""
+    first = [environment_seed(1000, seed) for seed in range(5)]
+    assert all(b - a >= MAX_ROLLOUTS for a, b in itertools.pairwise(first))
+    with pytest.raises(ValueError, match=r"n_rollouts=100001: expected at most 100,000"):
+        ReproductionSettings(n_rollouts=MAX_ROLLOUTS + 1)
+
+
 def test_a_failed_training_leaves_its_measurements_waiting(settings, demos, store, monkeypatch):
     """The training command's log says why; what needed the policy is not attempted."""
     broken = [sys.executable, "-c", "import sys; sys.exit('cannot: ' + sys.argv[1])"]
@@ -221,6 +311,66 @@ def test_every_style_is_used_equally_often(settings, demos):
         changed = dataclasses.replace(settings, n_rollouts=n_rollouts)
         one = evaluation(changed, demos, training(changed, demos, "zbc"), "x")
         assert one.definition["protocols"] == {"uniform": n_rollouts, "stratified": expected}
+
+
+def test_contracting_shares_its_plain_trainings_and_their_measurements(settings, demos):
+    """All that robustness measures on zbc and wzbc is the same cell; corrective ones train as long."""
+    suites = {name: set(suite_cells(name, settings, [demos])) for name in ("robustness", "contracting")}
+    plain = {cell for cell in suites["robustness"] if cell.labels.policy.split(" ")[0] in ("zbc", "wzbc")}
+    assert plain <= suites["contracting"]
+    trained = [cell for cell in suites["contracting"] if cell.kind == "train"]
+    chosen = sorted((c.definition["policy"], c.definition["config"]["corrective"]) for c in trained)
+    assert chosen == [("wzbc", "none"), ("zbc", "demos"), ("zbc", "noise"), ("zbc", "none")]
+    assert {(c.definition["steps"], c.definition["batch_size"]) for c in trained} == {(20, 16)}
+
+
+def test_the_other_wzbc_are_trained_on_spread_out_alone(settings, demos):
+    """p = 0.95 and beta = 3 in the suite robustness."""
+    named = {
+        name: {cell.labels.policy for cell in suite_cells("robustness", settings, [d])}
+        for name, d in (("a", demos), ("b", dataclasses.replace(demos, name="medium_maze-spread_out")))
+    }
+    assert {policy.replace(" hidden_dim=16", "") for policy in named["b"] - named["a"]} == {
+        "wzbc p=0.95",
+        "wzbc beta=3",
+    }
+
+
+def test_the_arms_tasks_are_perturbed_as_their_environment_offers(settings, demos):
+    """Shifted starts, noisy actions and, for aligning, a pushed box; the plain task first."""
+    for task, pushes in (("avoiding", set()), ("aligning", {0.02, 0.05})):
+        arm = dataclasses.replace(demos, env={"type": "d3il", "task": task})
+        cells = [c for c in suite_cells("contracting", settings, [arm]) if c.labels.policy == "playback"]
+        envs = [cell.definition["env"] for cell in cells]
+        assert cells[0].labels.condition == "deterministic"
+        assert {env["start_radius"] for env in envs} == {0.0, 0.02, 0.04}
+        assert {env["action_noise"] for env in envs} == {0.0, 0.002, 0.004}
+        assert {env["box_push"] for env in envs} == {0.0} | pushes
+
+
+def test_playback_is_measured_without_a_training(settings, demos, store):
+    """As many rollouts per seed as a policy's; on its own demonstrations it succeeds and keeps the style."""
+    one = playback(settings, demos, "deterministic")
+    assert run_cells([one], store, {demos.name: demos}, jobs=1) == []
+    rollouts = store.read(one)["rollouts"]
+    assert list(rollouts) == ["0", "1"]
+    for part in rollouts.values():
+        assert sorted(part["stratified"]["style"]) == [style for style in range(6) for _ in range(2)]
+        assert sum(part["stratified"]["success"]) == sum(part["stratified"]["match"]) == 12
+
+
+def test_the_work_that_is_left_is_counted(settings, demos, store, trained):
+    """Seed-steps of trainings and rollouts, neither of finished cells nor of trainings not needed again."""
+    wzbc = training(settings, demos, "wzbc")
+    cells = [trained, wzbc, *(evaluation(settings, demos, one, "x") for one in (trained, wzbc))]
+    assert format_work(cells, store) == (
+        "left: 40 seed-steps in 1 trainings by lerobot-swr-train, "
+        "0 seed-steps in 0 trainings by lerobot-train, 96 rollouts in 2 evaluations"
+    )
+    half = store.work_folder(wzbc) / "run" / "seed_0" / "checkpoints" / "000010"
+    half.mkdir(parents=True)
+    assert "left: 30 seed-steps" in format_work(cells, store)
+    assert format_work([trained], store).startswith("left: 0 seed-steps in 0 trainings")
 
 
 def test_policies_without_styles_are_rolled_out_once(settings, demos):

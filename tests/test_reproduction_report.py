@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import statistics
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import pytest
 
 from lerobot_swr.cli.report import main as report_command
 from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.reproduction import contracting_tables
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import (
     environment,
@@ -18,9 +20,10 @@ from lerobot_swr.reproduction.demonstrations import (
     short_path,
 )
 from lerobot_swr.reproduction.execution import run_cells
+from lerobot_swr.reproduction.perturbation_curves import SIZES
 from lerobot_swr.reproduction.publication import END, START, publish, readme_block, update_readme, with_block
 from lerobot_swr.reproduction.report import write_results_report
-from lerobot_swr.reproduction.settings import ReproductionSettings
+from lerobot_swr.reproduction.settings import SUITES, ReproductionSettings
 from lerobot_swr.reproduction.stored_results import load_suites
 from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.trajectories import Trajectories
@@ -31,12 +34,12 @@ REPOSITORY = Path(__file__).parent.parent
 def invented_result(one: Cell, lengths: list[int], behaviors: list[str], paths: list) -> dict:
     """What a perfect reproducer would store: each rollout is the demonstration of its style."""
     rollouts = {}
-    assert one.needs is not None
-    for seed in one.needs.definition["seeds"]:
+    acting = (one.needs or one).definition
+    for seed in acting["seeds"]:
         rollouts[str(seed)] = {}
         for protocol, count in one.definition["protocols"].items():
             styles = [i % len(behaviors) for i in range(count)]
-            styled = "style_sampling" in one.needs.definition["config"]
+            styled = "baseline" in acting or "style_sampling" in acting["config"]
             rollouts[str(seed)][protocol] = {
                 "behavior": [behaviors[i] for i in styles],
                 "success": [1] * count,
@@ -82,7 +85,7 @@ def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> No
     for module in ("suites", "tables", "figures"):
         monkeypatch.setattr(f"lerobot_swr.reproduction.{module}.LENGTH_BAND", (min(lengths), max(lengths)))
     paths = [short_path(path_of(env_cfg, episode)) for episode in trajectories.episodes()]
-    for suite in ("table1", "robustness", "control", "figures"):
+    for suite in SUITES:
         cells = suite_cells(suite, settings, [demos])
         for one in cells:
             if one.kind == "similarity":
@@ -104,7 +107,8 @@ def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> No
 def test_the_report_shows_every_suite_and_needs_no_other_file(drawn):
     """Tables, captioned pictures inside the page, commands and versions."""
     page = (drawn / "report.html").read_text()
-    for heading in ("Diversity", "Robustness", "Control", "Similarity and styles", "How this was made"):
+    headings = ("Diversity", "Robustness", "Contracting styles", "Control", "Similarity and styles")
+    for heading in (*headings, "How this was made"):
         assert f"<h2>{heading}" in page
     assert "Not finished" not in page
     assert page.count("<figcaption>") == page.count('<img src="data:image/png;base64,') >= 8
@@ -112,6 +116,44 @@ def test_the_report_shows_every_suite_and_needs_no_other_file(drawn):
     for suite in load_suites(drawn):
         assert f"lerobot-swr-reproduce --suite={suite}" in page
     assert "lerobot 0.6" in page
+
+
+def test_contracting_tables_have_a_row_per_condition_and_a_column_per_method(drawn):
+    """Success, style match and length error; invented rollouts are 3 steps shorter than their frames."""
+    suite = load_suites(drawn)["contracting"]
+    *rates, length_errors = contracting_tables.by_condition(suite, "small_maze")
+    methods = ["zbc", "wzbc", "zbc corrective=noise", "zbc corrective=demos", "playback"]
+    for table in (*rates, length_errors):
+        heads = [" ".join(head.split()) for head in table.header]
+        assert heads == ["condition seeds × n", *(f"{method} 2 × 12" for method in methods)]
+        conditions = [row[0] for row in table.rows]
+        assert conditions[:4] == ["deterministic", "pseudo-random start", "random start", "transition noise"]
+        assert conditions[-2:] == ["sticky walls", "sticky walls, noise 1"]
+        assert len(conditions) == 4 + 3 + 3 + 2
+    for table in rates:  # 24 of 24: Wilson's lower end is 1 / (1 + 1.96² / 24)
+        assert all(cell.startswith("1.000\n[0.862, 1.000]") for row in table.rows for cell in row[1:])
+    described = suite.datasets["small_maze"].result
+    errors = [
+        abs(frames - 3 - steps)
+        for frames, steps in zip(described["length"], described["steps_to_end"], strict=True)
+    ]
+    expected = f"{statistics.median(errors):.1f}\n["
+    assert all(cell.startswith(expected) for row in length_errors.rows for cell in row[1:])
+
+
+def test_curves_take_only_what_one_perturbation_changes():
+    """Each size belongs to its own curve; sticky walls and random starts to none."""
+    radius, noise = SIZES["maze2d"].values()
+    maze = {"start": "fixed", "start_radius": 0.1, "transition_noise": 0.0, "sticky_walls": False}
+    assert (radius(maze), noise(maze)) == (0.0, 0.0)
+    shifted = {**maze, "start": "pseudo_random", "start_radius": 0.2}
+    assert (radius(shifted), noise(shifted)) == (0.2, None)
+    noisy = {**maze, "transition_noise": 2.0}
+    assert (radius(noisy), noise(noisy)) == (None, 2.0)
+    for other in ({"start": "random"}, {"sticky_walls": True}):
+        assert (radius({**maze, **other}), noise({**maze, **other})) == (None, None)
+    arm = {"start_radius": 0.0, "action_noise": 0.004, "box_push": 0.0}
+    assert [size(arm) for size in SIZES["d3il"].values()] == [None, 0.004, None]
 
 
 def test_drawing_again_changes_nothing(drawn):

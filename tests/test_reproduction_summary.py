@@ -43,6 +43,17 @@ def test_a_summary_equals_the_hand_computed_one():
     assert (summary.n_seeds, summary.n_rollouts) == (2, 4)
 
 
+def test_length_errors_are_those_of_successes_with_the_right_behaviour():
+    """Styles 0 to 3 last 8, 9, 10 and 20 steps; of seed 0 all count, of seed 1 two do not."""
+    first = part("aabb", [0, 1, 2, 3], [10, 10, 10, 10])  # 2, 1, 0, 10
+    second = part("aaax", [0, 1, 2, 3], [11, 9, 99, 99])  # 3, 0
+    summary = summarize(result(first, second), "uniform", DEMONSTRATED, [8, 9, 10, 20])
+    assert summary.length_error == 1.5
+    assert summary.length_error_interval is not None
+    assert 0 <= summary.length_error_interval.low <= 1.5 <= summary.length_error_interval.high <= 10
+    assert summarize(result(part("xx", [0, 1])), "uniform", DEMONSTRATED, [8, 9]).length_error is None
+
+
 def test_wilson_interval_of_the_pooled_rollouts():
     """7 of 8, by the closed form."""
     summary = summarize(result(part("aabb", [0] * 4), part("aaax", [0] * 4)), "uniform", DEMONSTRATED)

@@ -85,8 +85,90 @@ def test_the_command_evaluates_every_perturbation(run_command, small_maze, tmp_p
         low, high = cell["success_interval"]["low"], cell["success_interval"]["high"]
         assert low <= cell["success_rate"] <= high
         assert cell["env"] == perturbed(Maze2DEnvConfig(task="small"))[cell["perturbation"]]
+        assert (cell["l1_floor"], cell["l1_floor_band"]["high"]) == (0, 0)  # each style once
     undisturbed = result["cells"][0]
     assert (undisturbed["success_rate"], undisturbed["style_match"], undisturbed["l1"]) == (1, 1, 0)
+
+
+def test_an_interrupted_evaluation_keeps_what_it_has(run_command, small_maze, tmp_path, monkeypatch):
+    """The second perturbation fails: the first one's results are in the file, with their provenance."""
+    calls = []
+
+    def fail_later(*args, **kwargs):
+        calls.append(args)
+        if len(calls) == 2:
+            raise RuntimeError("power cut")
+        return run_rollouts(*args, **kwargs)
+
+    monkeypatch.setattr("lerobot_swr.evaluation.robustness.run_rollouts", fail_later)
+    flags = ("--baseline=playback", "--robustness=true", "--n_episodes=3", f"--dataset.root={small_maze}")
+    with pytest.raises(RuntimeError, match="power cut"):
+        run_command(eval_command.main, *flags, f"--output_dir={tmp_path}", *ENV)
+    result = json.loads((tmp_path / "robustness.json").read_text())
+    assert [cell["perturbation"] for cell in result["cells"]] == ["as it is"]
+    assert result["provenance"]["seed"] == 1000
+    assert [path.name for path in tmp_path.iterdir()] == ["robustness.json"]
+
+
+def test_only_the_given_episodes_are_played_and_compared_with(
+    run_command, small_maze, demonstrations, tmp_path
+):
+    """--dataset.episodes: no other demonstration is known to the baseline, nor in the histogram."""
+    shown = [Maze2DEnvConfig(task="small").behavior_rule()(episode) for episode in demonstrations.episodes()]
+    chosen = [shown.index("10"), shown.index("20")]
+    flags = ("--baseline=playback", "--n_episodes=8", f"--dataset.root={small_maze}", *ENV)
+    more = (f"--dataset.episodes={chosen}", "--style_sampling=stratified")
+    run_command(eval_command.main, *flags, *more, f"--output_dir={tmp_path}")
+    result = json.loads((tmp_path / "behaviors.json").read_text())
+    assert sorted(episode["style_episode"] for episode in result["episodes"]) == sorted(chosen * 4)
+    assert result["reference_histogram"] == {"10": 0.5, "20": 0.5}
+    assert (result["style_fidelity"], result["l1"]) == (1, 0)
+    run_command(eval_command.main, *flags, *more, "--robustness=true", f"--output_dir={tmp_path}")
+    undisturbed = json.loads((tmp_path / "robustness.json").read_text())["cells"][0]
+    assert (undisturbed["style_match"], undisturbed["l1"], undisturbed["l1_floor"]) == (1, 0, 0)
+
+
+def test_playback_of_some_demonstrations_is_that_of_a_dataset_of_them(demonstrations):
+    """The others leave no trace in its actions."""
+    some = PlaybackPolicy(demonstrations, "fixed", [1, 3])
+    alone = PlaybackPolicy(demonstrations.subset([1, 3]), "fixed")
+    states = torch.from_numpy(demonstrations.columns[STATE][demonstrations.starts]) + 0.03
+    for policy in (some, alone):
+        policy.reset()
+    actions = [policy.select_action({STATE: states}) for policy in (some, alone)]
+    assert some.styles.active.tolist() == [1, 3] * 3
+    assert torch.equal(*actions)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (("--robustness=true", "--counterfactual=3", *ENV), ("--robustness", "--counterfactual")),
+        (("--robustness=true", "--blend=2", *ENV), ("--robustness", "--blend")),
+        (("--robustness=true", "--length_band=[1,2]", *ENV), ("--robustness", "--length_band")),
+        (("--counterfactual=3", "--n_episodes=7", *ENV), ("--counterfactual", "--n_episodes")),
+        (("--counterfactual=3", "--dataset.episodes=[1]", *ENV), ("--counterfactual", "--dataset.episodes")),
+        (("--blend=3", "--style_sampling=fixed", *ENV), ("--blend", "--style_sampling")),
+        (("--style_sampling=fixed", "--policy.style_sampling=uniform", *ENV), ("--policy.style_sampling",)),
+        (("--baseline=playback", "--policy.type=zbc", *ENV), ("--baseline", "--policy.*")),
+        (("--robustness=true",), ("--robustness", "--env.type")),
+        (("--counterfactual=3", "--behavior_rule=a:b"), ("--counterfactual, --behavior_rule", "--env.type")),
+    ],
+)
+def test_flags_without_effect_are_refused(run_command, small_maze, tmp_path, capsys, flags, named):
+    """The error names both flags, before anything is loaded."""
+    path = () if "--baseline=playback" in flags else ("--policy.path=x",)
+    with pytest.raises(SystemExit):
+        run_command(
+            eval_command.main,
+            *flags,
+            *path,
+            f"--dataset.root={small_maze}",
+            f"--output_dir={tmp_path / 'out'}",
+        )
+    error = capsys.readouterr().err
+    assert all(flag in error for flag in named)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_swr.sampling import SimilarityWeightedSampler
+from lerobot_swr.sampling import NUMBERS_PER_BLOCK, SimilarityWeightedSampler, StepGenerator
 from lerobot_swr.similarity import normalize_distances
 
 N = 5
@@ -121,3 +121,24 @@ def test_bad_options_are_named(options, message):
     """The error names key and value."""
     with pytest.raises(ValueError, match=message):
         make_sampler(**options)
+
+
+def test_random_numbers_are_a_function_of_the_step():
+    """Drawn one by one, together or from the middle: the same; of bounded memory, for large batches too."""
+    torch.manual_seed(3)
+    count = NUMBERS_PER_BLOCK // 3
+    one, many = StepGenerator(), StepGenerator()
+    singly = np.concatenate([one.uniforms(1, count) for _ in range(8)])
+    np.testing.assert_array_equal(many.uniforms(8, count), singly)
+    np.testing.assert_array_equal(one.uniforms_at(5, 2, count), singly[5 * count : 7 * count])
+    assert len(np.unique(singly)) == len(singly)
+    assert one.uniforms(1, 5 * NUMBERS_PER_BLOCK).shape == (5 * NUMBERS_PER_BLOCK,)
+    assert one._drawn[1].size == 5 * NUMBERS_PER_BLOCK  # those of one step alone
+
+
+def test_a_resumed_generator_goes_on():
+    """Seed and step are in the checkpoint."""
+    one, resumed = StepGenerator(), StepGenerator()
+    one.uniforms(7, 16)
+    resumed.load_state_dict(one.state_dict())
+    np.testing.assert_array_equal(resumed.uniforms(3, 16), one.uniforms(3, 16))

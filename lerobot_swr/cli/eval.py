@@ -49,6 +49,26 @@ from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactu
 from lerobot_swr.styles import check_style_sampling
 from lerobot_swr.trajectories import Trajectories
 
+# Flags beside which others have no effect.
+CONFLICTS = {
+    "robustness": ("counterfactual", "blend", "length_band"),
+    "counterfactual": (
+        "length_band",
+        "n_episodes",
+        "style_sampling",
+        "policy.style_sampling",
+        "dataset.episodes",
+    ),
+    "blend": ("length_band", "n_episodes", "style_sampling", "policy.style_sampling", "dataset.episodes"),
+    "length_band": ("dataset.episodes",),
+    "style_sampling": ("policy.style_sampling",),
+    "baseline": ("rename_map", "policy.*"),
+}
+NEEDS_ENV = (
+    *("robustness", "counterfactual", "blend", "length_band"),
+    *("style_sampling", "behavior_rule", "n_episodes"),
+)
+
 
 @dataclass
 class EvalCommand:
@@ -94,13 +114,10 @@ class EvalCommand:
         Raises:
             ValueError: Naming the offending key and value.
         """
-        if self.robustness and self.style_sampling is None:
-            self.style_sampling = "stratified"
         if self.style_sampling is not None:
             check_style_sampling(self.style_sampling)
+        self._refuse_conflicts()
         self._find_policy()
-        if self.robustness and self.env is None:
-            raise ValueError("robustness=true: name the environment with --env.type=...")
         if self.length_band is not None and len(self.length_band) != 2:
             raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
         for key in ("counterfactual", "blend"):
@@ -111,6 +128,33 @@ class EvalCommand:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
         if self.output_dir is None:
             self.output_dir = Path("outputs/swr_eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}"
+
+    def _refuse_conflicts(self) -> None:
+        """Refuse flags of which one would have no effect beside another."""
+        given = {
+            "robustness": self.robustness,
+            "counterfactual": self.counterfactual > 0,
+            "blend": self.blend > 0,
+            "length_band": self.length_band is not None,
+            "style_sampling": self.style_sampling is not None,
+            "behavior_rule": self.behavior_rule is not None,
+            "n_episodes": parser.parse_arg("n_episodes") is not None,
+            "dataset.episodes": self.dataset.episodes is not None,
+            "rename_map": bool(self.rename_map),
+            "baseline": self.baseline is not None,
+            "policy.style_sampling": any(o.startswith("--style_sampling") for o in _policy_overrides()),
+            "policy.*": self.policy is not None or bool(_policy_overrides()),
+        }
+        for first, others in CONFLICTS.items():
+            for second in others:
+                if given[first] and given[second]:
+                    raise ValueError(f"--{first} and --{second} exclude each other: leave out one of them")
+        useless = [key for key in NEEDS_ENV if given[key]]
+        if self.env is None and useless:
+            raise ValueError(
+                f"{', '.join(f'--{key}' for key in useless)}: this is about rollouts in an environment; "
+                "name one with --env.type=..., or leave it out to evaluate on the dataset's frames"
+            )
 
     def _find_policy(self) -> None:
         path = parser.get_path_arg("policy")
@@ -126,6 +170,8 @@ class EvalCommand:
                     f"baseline={self.baseline!r} has no styles to blend and acts in an environment: give "
                     "--env.type=... and leave out --blend"
                 )
+            if self.robustness:
+                self.style_sampling = self.style_sampling or "stratified"
             return
         if not path:
             raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
@@ -134,7 +180,9 @@ class EvalCommand:
                 f"policy.path={path!r}: no config.json in this folder; "
                 "give a checkpoint's pretrained_model folder"
             )
-        overrides = parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
+        overrides = _policy_overrides()
+        if self.robustness and not any(option.startswith("--style_sampling") for option in overrides):
+            self.style_sampling = self.style_sampling or "stratified"
         self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         self.policy.pretrained_path = Path(path)
         if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
@@ -144,6 +192,11 @@ class EvalCommand:
     def __get_path_fields__(cls) -> list[str]:
         """Keys that LeRobot's parser loads from a folder."""
         return ["policy"]
+
+
+def _policy_overrides() -> list[str]:
+    """The ``--policy.*`` options that are given beside the checkpoint."""
+    return parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
 
 
 @parser.wrap()
@@ -162,10 +215,18 @@ def evaluate(cfg: EvalCommand) -> None:
         return
 
     if cfg.robustness:
+        file, provenance = cfg.output_dir / "robustness.json", _provenance(cfg)
         robustness = run_robustness(
-            checkpoint, trajectories, cfg.env, _rule(cfg), cfg.n_episodes, cfg.batch_size, cfg.seed
+            checkpoint,
+            trajectories,
+            cfg.env,
+            _rule(cfg),
+            cfg.n_episodes,
+            cfg.batch_size,
+            cfg.seed,
+            reference_episodes=cfg.dataset.episodes,
+            after_each=lambda result: write_json(file, result, provenance),  # so that no result is lost
         )
-        write_json(cfg.output_dir / "robustness.json", robustness, _provenance(cfg))
         print(f"{title}\n{format_robustness(robustness)}\nwritten to {cfg.output_dir}")
         return
     if cfg.counterfactual or cfg.blend:
@@ -209,7 +270,9 @@ def evaluate(cfg: EvalCommand) -> None:
 def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
     if cfg.policy is None:
         trajectories = load_demonstrations(cfg.dataset.metadata())
-        return playback_checkpoint(trajectories, cfg.style_sampling or "uniform"), trajectories  # type: ignore[arg-type]
+        sampling = cfg.style_sampling or "uniform"
+        playback = playback_checkpoint(trajectories, sampling, cfg.dataset.episodes)  # type: ignore[arg-type]
+        return playback, trajectories
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
     return checkpoint, load_reference(cfg.dataset, checkpoint)
 

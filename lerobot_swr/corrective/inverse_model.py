@@ -65,8 +65,8 @@ def fit_inverse_model(
         absolute: Whether actions are targets; None asks the data.
 
     Raises:
-        ValueError: With fewer than 2 episodes, with a horizon longer than they are, or if no dimension of the
-            action is explained.
+        ValueError: With fewer than 2 episodes, with fewer than 2 that are longer than the horizon, or if no
+            dimension of the action is explained.
     """
     name = trajectories.name
     if len(trajectories) < 2:
@@ -79,7 +79,14 @@ def fit_inverse_model(
         raise ValueError(f"corrective_horizon={horizon}: expected 1 to {longest} steps, or null")
     data = _Frames(trajectories)
     targets = target_dimensions(data.states, data.actions, absolute)
-    horizons = range(1, longest + 1) if horizon is None else [horizon]
+    horizons = [h for h in (range(1, longest + 1) if horizon is None else [horizon]) if data.can_hold_out(h)]
+    if not horizons:
+        fix = "--policy.corrective=none" if horizon is None else "a smaller --policy.corrective_horizon"
+        raise ValueError(
+            f"dataset {name}: fewer than 2 of its {len(trajectories)} episodes are longer than the horizon "
+            f"of {horizon or 1}, and the inverse model is tested on held-out ones; record longer ones, or "
+            f"use {fix}"
+        )
     model = _choose([_fit(data, targets, h) for h in horizons])
     if not model.corrected.any():
         raise ValueError(
@@ -124,6 +131,10 @@ class _Frames:
         self.fold = np.repeat(np.arange(len(lengths)) % min(FOLDS, len(lengths)), lengths)
         last = np.repeat(trajectories.starts + lengths - 1, lengths)
         self.left = last - np.arange(len(last))
+
+    def can_hold_out(self, horizon: int) -> bool:
+        """Whether frames are left to fit when one fold is held out."""
+        return len(np.unique(self.fold[self.left >= horizon])) >= 2
 
 
 def _fit(data: _Frames, targets: np.ndarray, horizon: int) -> InverseModel:

@@ -1,8 +1,6 @@
 """Where on a demonstration is a state, and which frames of other demonstrations lie near it?"""
 
 import numpy as np
-import torch
-from torch import Tensor
 
 # As shares of the mean episode length, so that they do not depend on the control rate. In the medium maze
 # (76 steps) they are the 15 and 25 steps with which the method was found.
@@ -22,8 +20,10 @@ class DemonstratedPaths:
     that never change do not count.
 
     Attributes:
-        states: (F, d), raw.
+        states: (F, d) float32, raw.
         range: (d,) of each dimension.
+        lengths: (N,) frames per episode.
+        starts: (N,) row at which each episode starts.
         episode: (F,) episode of each frame.
         phase: (F,) progress of each frame in its episode, 0 to 1.
         window: How far from where it is expected a frame is looked for, in frames.
@@ -34,33 +34,25 @@ class DemonstratedPaths:
     """
 
     def __init__(self, states: np.ndarray, lengths: np.ndarray):
-        self.states = torch.from_numpy(states)
-        self.range = torch.from_numpy(np.ptp(states, axis=0))  # (d,)
+        self.states, self.lengths = states, lengths
+        self.range = np.ptp(states, axis=0)
         moving = self.range > 0
-        count = max(int(moving.sum()), 1)
-        self.metric = torch.where(moving, 1 / self.range, 0.0) / count**0.5  # (d,)
-        self._scaled = self.states * self.metric  # Euclidean distances of these are the distances
-        self.lengths = torch.from_numpy(lengths)
-        self.starts = self.lengths.cumsum(0) - self.lengths
-        self.episode = torch.arange(len(lengths)).repeat_interleave(self.lengths)  # (F,)
-        self.last = (self.starts + self.lengths - 1)[self.episode]  # (F,) last frame of a frame's episode
-        progress = torch.arange(len(states)) - self.starts[self.episode]
-        self.phase = progress / (self.lengths[self.episode] - 1).clamp(min=1)  # (F,) from 0 to 1
-        share = torch.linspace(0, 1, GRID)
+        metric = np.divide(1, self.range, out=np.zeros_like(self.range), where=moving)
+        self._metric = (metric / max(int(moving.sum()), 1) ** 0.5).astype(np.float32)  # (d,)
+        self._scaled = states * self._metric  # Euclidean distances of these are the distances
+        self.starts = lengths.cumsum() - lengths
+        self._last = self.starts + lengths - 1  # (N,) last row of each episode
+        self.episode = np.repeat(np.arange(len(lengths)), lengths)
+        progress = np.arange(len(states)) - self.starts[self.episode]
+        self.phase = (progress / np.maximum(lengths[self.episode] - 1, 1)).astype(np.float32)
+        share = np.linspace(0, 1, GRID)
         # (N, GRID) rows evenly spread over every episode
-        self._grid = self.starts[:, None] + (share * (self.lengths[:, None] - 1)).round().long()
+        self._grid = self.starts[:, None] + np.rint(share * (lengths[:, None] - 1)).astype(np.int64)
         self.window = max(1, round(WINDOW * float(lengths.mean())))
-        future = torch.linspace(0, LOOKAHEAD * float(lengths.mean()), FUTURE)
-        self._future = future.round().long()
+        self._offsets = np.arange(-self.window, self.window + 1)
+        self.future = np.rint(np.linspace(0, LOOKAHEAD * float(lengths.mean()), FUTURE)).astype(np.int64)
 
-    def to(self, device: torch.device) -> None:
-        """Move everything to a device; nothing happens if it is there."""
-        if self.states.device != device:
-            for name, value in vars(self).items():
-                if isinstance(value, Tensor):
-                    setattr(self, name, value.to(device))
-
-    def nearest(self, states: Tensor, around: Tensor) -> Tensor:
+    def nearest(self, states: np.ndarray, around: np.ndarray) -> np.ndarray:
         """The frame of a demonstration that is nearest to a state, near a frame where it is expected.
 
         Args:
@@ -70,31 +62,24 @@ class DemonstratedPaths:
         Returns:
             (B,) rows.
         """
-        offsets = torch.arange(-self.window, self.window + 1, device=states.device)
-        return self._nearest_among(states, self._inside(around[:, None] + offsets, self.episode[around]))
+        return self._nearest_among(states, around[:, None] + self._offsets, self.episode[around])
 
-    def nearest_of_episode(self, states: Tensor, episodes: Tensor) -> Tensor:
+    def nearest_of_episode(self, states: np.ndarray, episodes: np.ndarray) -> np.ndarray:
         """The nearest frame of the whole episode: (B,) rows for states (B, d) and (B,) episodes."""
-        offsets = torch.arange(int(self.lengths[episodes].max()), device=states.device)
-        rows = self.starts[episodes][:, None] + offsets
-        return self._nearest_among(states, self._inside(rows, episodes))
+        rows = self.starts[episodes][:, None] + np.arange(self.lengths[episodes].max())
+        return self._nearest_among(states, rows, episodes)
 
-    def _inside(self, rows: Tensor, episodes: Tensor) -> Tensor:
-        """Rows (B, ...) moved into their episodes (B,)."""
-        shape = (-1, *[1] * (rows.dim() - 1))
-        first = self.starts[episodes].view(shape)
-        return torch.clamp(rows, first, first + self.lengths[episodes].view(shape) - 1)
-
-    def _nearest_among(self, states: Tensor, rows: Tensor) -> Tensor:
-        scaled = (states * self.metric)[:, None]
-        place = (self._scaled[rows] - scaled).square().sum(dim=-1).argmin(dim=1)
-        return rows.gather(1, place[:, None]).squeeze(1)
+    def _nearest_among(self, states: np.ndarray, rows: np.ndarray, episodes: np.ndarray) -> np.ndarray:
+        """The nearest of (B, W) rows, after these have been moved into their (B,) episodes."""
+        rows = np.clip(rows, self.starts[episodes][:, None], self._last[episodes][:, None])
+        apart = self._scaled.take(rows, axis=0) - (states * self._metric)[:, None]
+        return rows[np.arange(len(rows)), np.einsum("bwd,bwd->bw", apart, apart).argmin(axis=1)]
 
     # --- Partner frames ---
 
     def draw_partners(
-        self, episodes: Tensor, candidates: Tensor, bandwidth: float, uniforms: Tensor
-    ) -> tuple[Tensor, Tensor]:
+        self, episodes: np.ndarray, candidates: np.ndarray, bandwidth: float, uniforms: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Draw frames of other demonstrations that lie near given ones.
 
         `CANDIDATES` frames are drawn uniformly over the other episodes, and one of them by its share in
@@ -110,34 +95,36 @@ class DemonstratedPaths:
         Returns:
             (B,) rows of the partner frames, and (B,) rows of demonstration j near them.
         """
-        others = len(candidates) - 1
-        place = (uniforms[:, :CANDIDATES] * others).long().clamp(max=others - 1)
-        place += place >= torch.searchsorted(candidates, episodes)[:, None]  # skips the frame's own episode
+        place = (uniforms[:, :CANDIDATES] * (len(candidates) - 1)).astype(np.int64)
+        place += place >= np.searchsorted(candidates, episodes)[:, None]  # skips the frame's own episode
         partners = candidates[place]  # (B, C)
         progress = uniforms[:, CANDIDATES : 2 * CANDIDATES] * self.lengths[partners]
-        rows = self.starts[partners] + torch.minimum(progress.long(), self.lengths[partners] - 1)
+        rows = self.starts[partners] + progress.astype(np.int64)
         grid = self._grid[episodes]  # (B, GRID)
-        cumulative = (-self._costs(rows, grid) / bandwidth).softmax(dim=1).double().cumsum(dim=1)
-        threshold = uniforms[:, -1:].double() * cumulative[:, -1:]
-        chosen = torch.searchsorted(cumulative, threshold, right=True).clamp(max=CANDIDATES - 1)
-        partner = rows.gather(1, chosen).squeeze(1)
+        cost = self._costs(rows, partners, grid)
+        cumulative = np.exp((cost.min(axis=1, keepdims=True) - cost) / bandwidth).cumsum(axis=1)
+        chosen = (cumulative <= uniforms[:, -1:] * cumulative[:, -1:]).sum(axis=1)
+        partner = rows[np.arange(len(rows)), np.minimum(chosen, CANDIDATES - 1)]
         return partner, self._expected(partner, grid)
 
-    def _costs(self, rows: Tensor, grid: Tensor) -> Tensor:
-        """(B, C) mean distance of the next frames of (B, C) rows to the nearest of (B, GRID) rows."""
-        ahead = torch.minimum(rows[..., None] + self._future, self.last[rows][..., None])  # (B, C, FUTURE)
-        x, y = self._scaled[ahead.flatten(1)], self._scaled[grid]
-        # |y|² − 2 x·y, to which |x|² is added after the minimum; float32 is exact enough for a coarse cost.
-        squared = torch.baddbmm(y.square().sum(dim=-1)[:, None], x, y.transpose(1, 2), alpha=-2).amin(dim=-1)
-        squared += x.square().sum(dim=-1)
-        return squared.clamp(min=0).sqrt().view(ahead.shape).mean(dim=-1)
+    def _costs(self, rows: np.ndarray, episodes: np.ndarray, grid: np.ndarray) -> np.ndarray:
+        """(B, C) mean distance of the next frames of rows (B, C) to the nearest of (B, GRID) rows."""
+        ahead = np.minimum(rows[..., None] + self.future, self._last[episodes][..., None])  # (B, C, FUTURE)
+        x, y = (self._scaled.take(some, axis=0) for some in (ahead.reshape(len(rows), -1), grid))
+        # |x − y|² = |x|² − 2 (x·y − |y|²/2), the bracket being one product of vectors of a dimension more;
+        # float32 is exact enough for a coarse cost.
+        y = np.concatenate([y, np.einsum("bgd,bgd->bg", y, y)[..., None] / -2], axis=2)
+        longer = np.concatenate([x, np.ones_like(x[..., :1])], axis=2)
+        product = y @ longer.swapaxes(1, 2)  # (B, GRID, C FUTURE)
+        squared = np.einsum("bcd,bcd->bc", x, x) - 2 * product.max(axis=1)
+        return np.sqrt(np.maximum(squared, 0)).reshape(ahead.shape).mean(axis=-1, dtype=np.float64)
 
-    def _expected(self, rows: Tensor, grid: Tensor) -> Tensor:
+    def _expected(self, rows: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """(B,) where frames (B,) are expected on other demonstrations, among (B, GRID) rows of these.
 
         The nearest one that has progressed alike: a path that passes a place twice is not mixed up.
         """
-        squared = (self._scaled[rows][:, None] - self._scaled[grid]).square().sum(dim=-1)
-        apart = (self.phase[rows][:, None] - self.phase[grid]).abs() > PHASE_WINDOW
-        place = squared.masked_fill(apart, torch.inf).argmin(dim=1, keepdim=True)
-        return grid.gather(1, place).squeeze(1)
+        apart = self._scaled.take(grid, axis=0) - self._scaled[rows][:, None]
+        squared = np.einsum("bgd,bgd->bg", apart, apart)
+        squared[np.abs(self.phase.take(grid) - self.phase[rows][:, None]) > PHASE_WINDOW] = np.inf
+        return grid[np.arange(len(grid)), squared.argmin(axis=1)]

@@ -38,25 +38,21 @@ def target_dimensions(states: np.ndarray, actions: np.ndarray, absolute: bool | 
     return found
 
 
-def relative_to_state(actions: Tensor, states: Tensor, targets: Tensor) -> Tensor:
+def relative_to_state(actions: np.ndarray, states: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Actions (F, A) minus the states (F, d) whose `targets` (A,) they are, in raw units."""
-    return actions - states[:, targets.clamp(min=0)] * (targets >= 0)
+    return actions - states[:, np.maximum(targets, 0)] * (targets >= 0).astype(states.dtype)
 
 
 @dataclass(frozen=True)
 class Units:
-    """The linear map from raw to normalised numbers: normalised = scale · raw + offset, (d,) each."""
+    """The linear map from raw to normalised numbers: normalised = scale · raw + offset, (d,) float64 each."""
 
-    scale: Tensor
-    offset: Tensor
+    scale: np.ndarray
+    offset: np.ndarray
 
-    def normalize(self, raw: Tensor) -> Tensor:
-        """Normalised numbers (F, d) of raw ones."""
-        return raw * self.scale + self.offset
-
-    def to(self, device: torch.device) -> "Units":
-        """The same on a device."""
-        return Units(self.scale.to(device), self.offset.to(device))
+    def normalize(self, raw: np.ndarray) -> np.ndarray:
+        """Normalised float32 numbers (F, d) of raw ones."""
+        return (raw * self.scale + self.offset).astype(np.float32)
 
 
 class RelativeActions(nn.Module):
@@ -97,9 +93,13 @@ class RelativeActions(nn.Module):
             relative = actions[:, k].astype(np.float64) - states[:, m]
             mean, std = float(relative.mean()), float(relative.std()) or 1.0
             scale, offset = float(action.scale[k]), float(action.offset[k])
-            gain = scale / float(state.scale[m])
-            self.state_gain[k, m] = gain
-            self.offset[k] = scale * mean + offset - gain * float(state.offset[m])
+            if state.scale[m] == 0:  # a state that never changes
+                self.state_gain[k, m] = 0.0
+                self.offset[k] = scale * (mean + float(states[0, m])) + offset
+            else:
+                gain = scale / float(state.scale[m])
+                self.state_gain[k, m] = gain
+                self.offset[k] = scale * mean + offset - gain * float(state.offset[m])
             self.scale[k] = scale * std
 
     def encode(self, actions: Tensor, states: Tensor) -> Tensor:

@@ -192,8 +192,7 @@ def compare(
     sampling, drawn = None, None
     if checkpoint.has_styles:
         sampling = checkpoint.policy.config.style_sampling
-        allowed = checkpoint.policy.styles.allowed().tolist()  # type: ignore[union-attr, operator]
-        drawn = [episode for episode in allowed if episode < len(demonstrated)] or None
+        drawn = allowed_episodes(checkpoint, len(demonstrated))
     chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
     return Comparison(
         evaluate_behaviors(
@@ -208,6 +207,12 @@ def compare(
         [(path_of(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
         [(path_of(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
     )
+
+
+def allowed_episodes(checkpoint: Checkpoint, n_demonstrations: int) -> list[int] | None:
+    """The demonstrations whose styles a style policy may draw; None where it has none of theirs."""
+    allowed = checkpoint.policy.styles.allowed().tolist()  # type: ignore[union-attr, operator]
+    return [episode for episode in allowed if episode < n_demonstrations] or None
 
 
 def steps_to_end(env_cfg: EnvConfig, trajectories: Trajectories) -> list[int]:

@@ -1,6 +1,6 @@
 """Robustness: the same policy in its environment and in perturbed ones, each style equally often."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,7 +8,12 @@ from lerobot.envs import EnvConfig
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import BehaviorResult, evaluate_behaviors, steps_to_end
+from lerobot_swr.evaluation.behavior_evaluation import (
+    BehaviorResult,
+    allowed_episodes,
+    evaluate_behaviors,
+    steps_to_end,
+)
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import Interval
 from lerobot_swr.evaluation.rollouts import run_rollouts
@@ -34,6 +39,8 @@ class RobustnessCell:
     length_error: float | None
     length_error_interval: Interval | None
     l1: float
+    l1_floor: float
+    l1_floor_band: Interval
 
     @classmethod
     def of(cls, perturbation: str, env: dict[str, Any], result: BehaviorResult) -> "RobustnessCell":
@@ -49,6 +56,8 @@ class RobustnessCell:
             result.length_error,
             result.length_error_interval,
             result.l1,
+            result.l1_floor,
+            result.l1_floor_band,
         )
 
 
@@ -89,6 +98,8 @@ def run_robustness(
     batch_size: int,
     seed: int,
     only: Sequence[str] | None = None,
+    reference_episodes: Sequence[int] | None = None,
+    after_each: Callable[[RobustnessResult], None] = lambda result: None,
 ) -> RobustnessResult:
     """Roll a policy out under every perturbation of its environment.
 
@@ -103,6 +114,8 @@ def run_robustness(
         batch_size: Largest number of environments that run at once.
         seed: Seeds the drawing of styles and the environments.
         only: Names of the perturbations; None takes all.
+        reference_episodes: The demonstrations to compare histograms with; None takes all.
+        after_each: Called after each perturbation with all results up to then.
 
     Raises:
         ValueError: If the environment has no perturbations.
@@ -110,28 +123,33 @@ def run_robustness(
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     lengths = steps_to_end(env_cfg, trajectories)
     sampling = checkpoint.policy.config.style_sampling if checkpoint.has_styles else None
-    cells = []
+    drawn = allowed_episodes(checkpoint, len(demonstrated)) if checkpoint.has_styles else None
+    cells: list[RobustnessCell] = []
     for name, options in perturbed(env_cfg).items():
         if only is not None and name not in only:
             continue
         rollouts = run_rollouts(checkpoint, replace(env_cfg, **options), rule, n_episodes, batch_size, seed)
         result = evaluate_behaviors(
-            rollouts, demonstrated, sampling, demonstrated_lengths=lengths, env_cfg=env_cfg
+            rollouts, demonstrated, sampling, reference_episodes, drawn, lengths, env_cfg
         )
         cells.append(RobustnessCell.of(name, options, result))
+        after_each(RobustnessResult(sampling, list(cells)))
     return RobustnessResult(sampling, cells)
 
 
 def format_robustness(result: RobustnessResult) -> str:
     """A table for the terminal."""
-    lines = [f"{'perturbation':<18} {'success':>22} {'style match':>22} {'length error':>20}"]
+    lines = [
+        f"{'perturbation':<18} {'success':>22} {'style match':>22} {'length error':>20} {'L1 (floor)':>14}"
+    ]
     for cell in result.cells:
         figures = [
             _with_interval(cell.success_rate, cell.success_interval, 2),
             _with_interval(cell.style_match, cell.style_match_interval, 2),
             _with_interval(cell.length_error, cell.length_error_interval, 1),
         ]
-        lines.append(f"{cell.perturbation:<18} {figures[0]:>22} {figures[1]:>22} {figures[2]:>20}")
+        l1 = f"{cell.l1:.2f} ({cell.l1_floor:.2f})"
+        lines.append(f"{cell.perturbation:<18} {figures[0]:>22} {figures[1]:>22} {figures[2]:>20} {l1:>14}")
     n = result.cells[0].n_episodes if result.cells else 0
     lines.append(f"{n} rollouts each; Wilson 95 %, bootstrap 95 % of the median length error in steps")
     return "\n".join(lines)

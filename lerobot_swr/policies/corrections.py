@@ -1,5 +1,7 @@
 """What corrective labels change in a style policy: its frames, and what its network predicts."""
 
+import logging
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,8 +10,9 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_swr.configuration import is_resuming, training_episodes
 from lerobot_swr.corrective.inverse_model import InverseModel, fit_inverse_model, log_inverse_model
-from lerobot_swr.corrective.labels import SHARE, CorrectiveLabels
+from lerobot_swr.corrective.labels import CorrectiveLabels
 from lerobot_swr.corrective.relative_actions import RelativeActions, Units
 from lerobot_swr.policies.configuration_swr import ZBCConfig
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
@@ -17,30 +20,102 @@ from lerobot_swr.sampling import StepGenerator
 from lerobot_swr.trajectories import Trajectories
 
 STREAM = 1  # of random numbers; pairs are drawn from stream 0
+BLOCK = 256  # corrective frames that are drawn together
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What corrective labels take from a training dataset.
+
+    Attributes:
+        episodes: (M,) the episodes that are trained on.
+        trajectories: These episodes.
+        model: Their inverse model; None without corrective labels.
+    """
+
+    episodes: np.ndarray
+    trajectories: Trajectories
+    model: InverseModel | None
 
 
 def describe_dynamics(
-    config: ZBCConfig, meta: LeRobotDatasetMetadata, trajectories: Trajectories
-) -> InverseModel:
+    config: ZBCConfig, meta: LeRobotDatasetMetadata, trajectories: Trajectories, from_checkpoint: bool
+) -> Dynamics | None:
     """Fit the inverse model of a training dataset, log it and note it in the configuration.
 
+    Args:
+        config: The policy's configuration.
+        meta: Metadata of the training dataset.
+        trajectories: All of its episodes.
+        from_checkpoint: Whether the network comes from a checkpoint: what its outputs mean is then kept.
+
+    Returns:
+        None where nothing of the dataset is needed.
+
     Raises:
-        ValueError: If corrective labels cannot work on this dataset.
+        ValueError: If corrective labels cannot work on this dataset, or a flag contradicts the checkpoint.
     """
-    model = fit_inverse_model(trajectories, config.corrective_horizon, config.corrective_relative)
+    if from_checkpoint:
+        _check_outputs(config, trajectories)
+    config.inverse_horizon = config.inverse_r2 = None
+    if config.corrective == "none" and config.action_targets is None:
+        return None
+    chosen = training_episodes(meta)
+    episodes = np.arange(len(trajectories)) if chosen is None else np.sort(chosen)
+    trained = trajectories if len(episodes) == len(trajectories) else trajectories.subset(episodes.tolist())
+    if config.corrective == "none":
+        return Dynamics(episodes, trained, None)
+    model = fit_inverse_model(trained, config.corrective_horizon, config.corrective_relative)
     log_inverse_model(model, meta.features[ACTION].get("names"))
     config.inverse_horizon, config.inverse_r2 = model.horizon, [round(float(r2), 4) for r2 in model.r2]
-    config.action_targets = model.targets.tolist() if (model.targets >= 0).any() else None
-    return model
+    targets = model.targets.tolist() if (model.targets >= 0).any() else None
+    if not from_checkpoint:
+        config.action_targets = targets
+    elif targets != config.action_targets:
+        logger.warning(
+            "The network keeps the checkpoint's outputs, %s, although this dataset's actions are %s.",
+            _name_outputs(config.action_targets),
+            _name_outputs(targets),
+        )
+    return Dynamics(episodes, trained, model)
+
+
+def _check_outputs(config: ZBCConfig, trajectories: Trajectories) -> None:
+    """Refuse what contradicts the meaning of a checkpoint's outputs."""
+    targets, wanted = config.action_targets, config.corrective_relative
+    if wanted is not None and wanted != (targets is not None) and not is_resuming():
+        raise ValueError(
+            f"corrective_relative={str(wanted).lower()}: the checkpoint's network predicts "
+            f"{_name_outputs(targets)}, and fine-tuning keeps that; give --policy.corrective_relative=null, "
+            "or train a new policy"
+        )
+    state_dim, action_dim = (trajectories.columns[key].shape[1] for key in (OBS_STATE, ACTION))
+    if targets is not None and (len(targets) != action_dim or max(targets) >= state_dim):
+        raise ValueError(
+            f"action_targets={targets} of the checkpoint: the dataset's actions have {action_dim} dimensions "
+            f"and its states {state_dim}; train a new policy on it"
+        )
+
+
+def _name_outputs(targets: list[int] | None) -> str:
+    return "actions" if targets is None else f"actions relative to the state (action_targets={targets})"
 
 
 class Corrections(nn.Module):
     """The corrective part of a style policy; all in normalised units.
 
+    Half of a batch is replaced by corrective frames. These do not depend on the batch: they are drawn from
+    all frames that are trained on, for many steps at once, because for the few of one step the overhead of
+    each operation would be noticeable. Frame n is a pure function of the seed and of the episodes trained on
+    so far, so a resumed run finds the same.
+
     Attributes:
-        relative: Translates between actions and the network's outputs; None where actions are no targets.
-        draws: Source of the random numbers.
-        labels: The dataset's corrective labels; None outside of training.
+        relative: Translates between actions and the network's outputs; None where it predicts actions.
+        draws: Source of the random numbers; its step counts the frames of all batches, two for each
+            corrective frame.
+        labels: The dataset's corrective labels; None where none are used.
 
     Args:
         config: The policy's configuration.
@@ -55,61 +130,117 @@ class Corrections(nn.Module):
             self.relative = RelativeActions(len(config.action_targets), state_dim)
         self.labels: CorrectiveLabels | None = None
         self._units: dict[str, Units] = {}
+        self._block: tuple[Any, dict[str, Tensor]] | None = None  # the last one
+        self._places: dict[Any, tuple[Tensor, Tensor]] = {}
 
     def adopt_dataset(
-        self, config: ZBCConfig, trajectories: Trajectories, stats: dict[str, Any], model: InverseModel
+        self, config: ZBCConfig, dynamics: Dynamics, stats: dict[str, Any], weights: Tensor | None
     ) -> None:
         """Prepare for training.
 
         Args:
             config: The policy's configuration.
-            trajectories: The training dataset.
+            dynamics: What is known of the training dataset.
             stats: Its statistics, by which LeRobot normalises.
-            model: Its inverse model.
+            weights: (N,) factor of the loss of each episode's frames; None for 1.
         """
+        trajectories = dynamics.trajectories
         columns = {key: trajectories.columns[key] for key in [*config.observation_keys, ACTION]}
         preprocessor, _ = make_bc_pre_post_processors(config, stats)
         self._units = _units_of(preprocessor, columns)
         if self.relative is not None:
             state, action = self._units[OBS_STATE], self._units[ACTION]
-            self.relative.fit(columns[OBS_STATE], columns[ACTION], model.targets, state, action)
-        self.labels = CorrectiveLabels(
-            trajectories,
-            model,
-            config.corrective,  # type: ignore[arg-type]
-            config.corrective_scale,
-            config.observation_keys,
-        )
+            targets = np.array(config.action_targets)
+            self.relative.fit(columns[OBS_STATE], columns[ACTION], targets, state, action)
+        if dynamics.model is not None:
+            kind, scale = config.corrective, config.corrective_scale
+            self.labels = CorrectiveLabels(
+                trajectories,
+                dynamics.model,
+                kind,  # type: ignore[arg-type]
+                scale,
+                config.observation_keys,
+            )
+            self._episodes = dynamics.episodes
+            self._weights = np.ones(len(trajectories)) if weights is None else weights.cpu().numpy()
 
-    def correct(
-        self, drawn: dict[str, Tensor], own: dict[str, Tensor], rows: Tensor, trained: Tensor, steps: int
-    ) -> dict[str, Tensor]:
-        """Put corrective frames in the place of about half of what a policy drew.
+    def correct(self, drawn: dict[str, Tensor], trained: Tensor, steps: int) -> dict[str, Tensor]:
+        """Put corrective frames in the place of the first half of every step's frames.
+
+        Frames come in random order. Where their number is odd, the larger half is corrective every other
+        time.
 
         Args:
             drawn: What the policy's `draw` prepared for (B,) frames.
-            own: What `drawn` holds for a frame under its own episode's style, where that differs.
-            rows: (B,) frames of the dataset.
-            trained: (N,) non-zero where an episode takes part in training.
+            trained: (N,) non-zero where an episode was trained on.
             steps: Number of steps whose frames these are.
 
         Returns:
             `drawn` with these frames replaced, ``corrective`` (B,), True where they are, and actions as the
             network is to predict them.
         """
+        drawn = self.encode(drawn)
         if self.labels is None:
-            return self.encode(drawn)
-        device, per_frame = rows.device, self.labels.draws_per_frame
-        self.labels.to(device)
-        numbers = self.draws.uniforms(steps, len(rows) // steps * per_frame)
-        uniforms = torch.from_numpy(numbers.reshape(-1, per_frame))
-        corrected = self.labels.relabel(rows, uniforms.to(device), trained.nonzero().squeeze(1))
-        raw = {**corrected.observations, ACTION: corrected.actions}
-        new = {key: self._units[key].to(device).normalize(value) for key, value in raw.items()}
-        new |= {key: value[corrected.places].to(drawn[key]) for key, value in own.items() if key in drawn}
-        replaced = {key: drawn[key].index_copy(0, corrected.places, value) for key, value in new.items()}
-        corrective = torch.zeros_like(rows, dtype=torch.bool).index_fill_(0, corrected.places, True)
-        return self.encode({**drawn, **replaced, "corrective": corrective})
+            return drawn
+        first, count = int(self.draws.step), len(drawn[ACTION])
+        self.draws.step.add_(count)  # `+=` would have the module register it anew
+        device = drawn[ACTION].device
+        places, corrective = self._half(count // steps, steps, first % 2, device)
+        frames = self._frames(first // 2, (first + count) // 2, trained, device)
+        replaced = {key: drawn[key].index_copy(0, places, value) for key, value in frames.items()}
+        if "relabelled" in drawn:
+            replaced["relabelled"] = drawn["relabelled"] & ~corrective
+        return {**drawn, **replaced, "corrective": corrective}
+
+    def _half(self, count: int, steps: int, first: int, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Which of `steps` times `count` frames are corrective: (P,) places, and (B,) True there."""
+        key = (count, steps, first, device)
+        if key not in self._places:
+            edges = (first + count * np.arange(steps + 1)) // 2
+            corrective = np.arange(count) < np.diff(edges)[:, None]  # (steps, count)
+            places = np.flatnonzero(corrective)
+            kept = dict(list(self._places.items())[-3:])
+            value = torch.from_numpy(places).to(device), torch.from_numpy(corrective.reshape(-1)).to(device)
+            self._places = {**kept, key: value}
+        return self._places[key]
+
+    def _frames(self, first: int, last: int, trained: Tensor, device: torch.device) -> dict[str, Tensor]:
+        """Corrective frames `first` to `last` - 1, as `draw` of a policy returns frames."""
+        marked = trained.cpu().numpy()
+        parts: list[dict[str, Tensor]] = []
+        while first < last or not parts:
+            block, place = divmod(first, BLOCK)
+            content = self._drawn_block(block, marked, device)
+            stop = min(place + last - first, BLOCK)
+            parts.append({key: value[place:stop] for key, value in content.items()})
+            first += stop - place
+        if len(parts) == 1:
+            return parts[0]
+        return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
+
+    def _drawn_block(self, block: int, trained: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+        """A block of corrective frames; it is drawn anew when further episodes have been trained on."""
+        key = (int(self.draws.seed), block, trained.tobytes(), device)
+        if self._block is None or self._block[0] != key:
+            self._block = key, self._draw_block(block, trained, device)
+        return self._block[1]
+
+    def _draw_block(self, block: int, trained: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+        assert self.labels is not None
+        per_frame = self.labels.draws_per_frame
+        candidates = np.flatnonzero(trained[self._episodes])
+        if len(candidates) == 0:
+            raise ValueError(
+                "none of the episodes in training is among those that --dataset.episodes and "
+                "--dataset.eval_split leave to train on"
+            )
+        uniforms = self.draws.uniforms_at(block * BLOCK, BLOCK, per_frame).reshape(BLOCK, per_frame)
+        frames = self.labels.draw(uniforms, candidates)
+        raw = {**frames.observations, ACTION: frames.actions}
+        episodes = self._episodes[frames.episodes]
+        content = {key: self._units[key].normalize(value) for key, value in raw.items()}
+        content |= {"weight": self._weights[episodes].astype(np.float32), "style_episode": episodes}
+        return self.encode({key: torch.from_numpy(value).to(device) for key, value in content.items()})
 
     def encode(self, drawn: dict[str, Tensor]) -> dict[str, Tensor]:
         """`drawn` with actions as the network is to predict them."""
@@ -131,7 +262,7 @@ class Corrections(nn.Module):
         if "corrective" not in drawn:
             return {}
         corrective = drawn["corrective"].cpu().numpy()
-        return {"corrective_loss": float((losses.cpu().numpy() * corrective).mean()) / SHARE}
+        return {"corrective_loss": float(losses.cpu().numpy() @ corrective) / (0.5 * len(corrective))}
 
 
 def _units_of(preprocessor: Any, columns: dict[str, np.ndarray]) -> dict[str, Units]:
@@ -139,14 +270,11 @@ def _units_of(preprocessor: Any, columns: dict[str, np.ndarray]) -> dict[str, Un
 
     A constant dimension is mapped to what its constant becomes.
     """
-    ends = {
-        key: torch.from_numpy(np.stack([column.min(axis=0), column.max(axis=0)]))  # (2, d)
-        for key, column in columns.items()
-    }
-    normalized = preprocessor(ends)
+    ends = {key: np.stack([column.min(axis=0), column.max(axis=0)]) for key, column in columns.items()}
+    normalized = preprocessor({key: torch.from_numpy(value) for key, value in ends.items()})  # (2, d)
     units = {}
-    for key, (low, high) in ends.items():
-        low_to, high_to = normalized[key].double().cpu()
-        scale = torch.where(high > low, (high_to - low_to) / (high - low), 0.0)
-        units[key] = Units(scale.float(), (low_to - scale * low).float())
+    for key, (low, high) in ((key, value.astype(np.float64)) for key, value in ends.items()):
+        low_to, high_to = normalized[key].cpu().double().numpy()
+        scale = np.divide(high_to - low_to, high - low, out=np.zeros(len(low)), where=high > low)
+        units[key] = Units(scale, low_to - scale * low)
     return units

@@ -11,7 +11,7 @@ from torch import Tensor
 from lerobot_swr.style_encoding import encode_styles
 
 if TYPE_CHECKING:
-    from lerobot_swr.policies.modeling_swr import ZBCPolicy
+    from lerobot_swr.policies.zbc_policy import ZBCPolicy
 
 # Encoding happens in the middle of training, so it spends less than `lerobot-swr-styles --add`.
 ENCODING_STEPS = 100

@@ -21,7 +21,7 @@ class StateConfig(PreTrainedConfig):
     optimizer_betas: tuple[float, float] = (0.9, 0.999)
     optimizer_weight_decay: float = 0.0
     # Largest norm of the gradient; 0 does not clip.
-    optimizer_grad_clip_norm: float = 10.0
+    optimizer_grad_clip_norm: float = 0.0
     # "cosine" (to 0 at the run's last step, whatever --steps is) or "constant".
     lr_schedule: str = "cosine"
     # Treat numbers below 1e-38 as 0 in this process; they make the CPU several times slower.

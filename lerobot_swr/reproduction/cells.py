@@ -10,13 +10,13 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-FORMAT = 1  # of results; another one makes every cell a new one
+FORMAT = 2  # of results; another one makes every cell a new one
 PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy")
 
 
@@ -39,9 +39,9 @@ class Labels:
         return " / ".join(part for part in (self.dataset, self.policy, self.condition) if part)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Cell:
-    """One piece of the experiments.
+    """One piece of the experiments; cells with the same key are the same.
 
     Attributes:
         kind: ``dataset``, ``train``, ``evaluate``, ``styles`` or ``similarity``: who computes it.
@@ -52,7 +52,7 @@ class Cell:
 
     kind: str
     labels: Labels
-    definition: Mapping[str, Any] = field(hash=False)
+    definition: Mapping[str, Any]
     needs: "Cell | None" = None
 
     @cached_property
@@ -60,7 +60,16 @@ class Cell:
         """Hash of everything that defines the cell."""
         needs = None if self.needs is None else self.needs.key
         content = {"format": FORMAT, "kind": self.kind, "needs": needs, "definition": self.definition}
-        return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:12]
+        text = json.dumps(_plain(content), sort_keys=True)
+        return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both have the same key."""
+        return isinstance(other, Cell) and self.key == other.key
+
+    def __hash__(self) -> int:
+        """Of the key."""
+        return hash(self.key)
 
     @property
     def slug(self) -> str:
@@ -107,6 +116,14 @@ class Store:
         """The file that a failed attempt leaves and the next attempt removes."""
         return self.work_folder(cell) / "failed.txt"
 
+    def running_path(self, cell: Cell) -> Path:
+        """The file that is there while the cell is computed, and stays if that is killed."""
+        return self.work_folder(cell) / "running"
+
+    def is_running(self, cell: Cell) -> bool:
+        """Whether an attempt has begun and not come to an end."""
+        return self.running_path(cell).is_file()
+
     def read(self, cell: Cell) -> dict[str, Any]:
         """The result of a finished cell."""
         return json.loads(self.result_path(cell).read_text())["result"]
@@ -143,6 +160,15 @@ class Store:
             yield descriptor
         finally:
             os.close(descriptor)
+
+
+def _plain(value: Any) -> Any:
+    """JSON values in which 1 and 1.0, a tuple and a list are the same."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(one) for one in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def write_text(path: Path, text: str) -> None:

@@ -1,9 +1,11 @@
 """The datasets of the experiments: made where absent, and described for everything that comes after."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import draccus
 import numpy as np
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION
@@ -12,7 +14,7 @@ from lerobot_swr.behaviors import DATASET_RULES
 from lerobot_swr.demos.catalog import RECIPES, get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.evaluation.behavior_evaluation import path_of, steps_to_end
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.evaluation.length_control import frames_after_end
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
@@ -89,10 +91,9 @@ def load_low_dimensional(root: Path) -> Trajectories:
     )
 
 
-def environment(options: dict[str, Any]) -> TaskEnvConfig:
-    """The environment's configuration from its options."""
-    options = dict(options)
-    config = EnvConfig.get_choice_class(options.pop("type"))(**options)
+def environment(options: Mapping[str, Any]) -> TaskEnvConfig:
+    """The environment's configuration from its type and the options that differ from its defaults, or all."""
+    config = draccus.decode(EnvConfig, dict(options))
     assert isinstance(config, TaskEnvConfig)
     return config
 
@@ -109,6 +110,7 @@ def _describe(trajectories: Trajectories, env_cfg: TaskEnvConfig) -> dict[str, A
     return {
         "behavior": [rule(episode) for episode in trajectories.episodes()],
         "length": trajectories.lengths.tolist(),
+        "steps_to_end": steps_to_end(env_cfg, trajectories),
         "frames_after_end": frames_after_end(trajectories, env_cfg),
         "path_episodes": list(range(0, len(trajectories), stride)),
         "paths": [

@@ -2,29 +2,32 @@
 
 import contextlib
 import json
-import sys
-import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from joblib import Parallel, delayed
-from tqdm import tqdm
 
 from lerobot_swr.reproduction.baselines import known_policies, missing_extras
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
+from lerobot_swr.reproduction.planning import (
+    format_states,
+    format_work,
+    is_finished,
+    progress,
+    unfinished_chains,
+)
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
 from lerobot_swr.reproduction.suites import DATASETS, suite_cells
-from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done, train
-
-LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
+from lerobot_swr.reproduction.training import train
 
 
 @dataclass(frozen=True)
@@ -65,16 +68,17 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
     suites = {name: settings.choose_datasets(DATASETS[name]) for name in settings.suites}
     names = dict.fromkeys(name for datasets in suites.values() for name in datasets)
     prepared = {name: prepare(name, settings.dataset_folder, store) for name in names}
-    cells: dict[Cell, None] = {}
+    cells: dict[Cell, Cell] = {}  # the first name of what several suites ask for
     for suite, datasets in suites.items():
         of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])
+        of_suite = [cells.setdefault(cell, cell) for cell in of_suite]
         if of_suite and not settings.dry_run:
             _write_manifest(store, suite, command, of_suite, [prepared[name] for name in datasets])
-        cells.update(dict.fromkeys(of_suite))
     if not cells:
         raise ValueError(f"datasets={settings.datasets}, policies={settings.policies}: nothing to run")
     if settings.dry_run:
         print(format_states(list(cells), store))
+        print(format_work(list(cells), store))
         return []
     failures = run_cells(list(cells), store, prepared, settings.jobs)
     print(format_states(list(cells), store))
@@ -87,7 +91,8 @@ def run_cells(
     """Compute the cells that are not finished.
 
     A training and everything measured on it form a chain, which one worker goes through; chains run in
-    parallel.
+    parallel. If a worker process is killed (out of memory, say), those chains that were under way are run
+    again, one at a time after all others; whichever kills its worker again has failed.
 
     Args:
         cells: The cells, in any order.
@@ -98,34 +103,43 @@ def run_cells(
     chains = unfinished_chains(cells, store)
     workers = {} if jobs is None else {"n_jobs": jobs}
     roots = {name: demos.root.resolve() for name, demos in datasets.items()}
-    with _progress([cell for chain in chains for cell in chain], store):
-        outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chains)
-    return [failure for failures in outcomes for failure in failures]
+    for cell in (cell for chain in chains for cell in chain):
+        store.failure_path(cell).unlink(missing_ok=True)
+        store.running_path(cell).unlink(missing_ok=True)
+    failures: dict[Cell, Failure] = {}
+
+    def attempt(chosen: list[list[Cell]]) -> list[list[Cell]]:
+        """Run chains; those that were under way when a worker was killed."""
+        try:
+            outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chosen)
+            failures.update({failure.cell: failure for of_chain in outcomes for failure in of_chain})
+            return []
+        except BrokenProcessPool:
+            known = [cell for chain in chosen for cell in chain if store.failure_path(cell).is_file()]
+            failures.update({cell: _stored_failure(cell, store) for cell in known})
+            under_way = [chain for chain in chosen if any(map(store.is_running, chain))]
+            return under_way or chosen[:1]
+
+    with progress([cell for chain in chains for cell in chain], store):
+        alone: list[list[Cell]] = []
+        while chains:
+            interrupted = attempt(chains)
+            alone += interrupted
+            left = [_left_of(chain, store, failures) for chain in chains if chain not in interrupted]
+            chains = [chain for chain in left if chain] if interrupted else []
+        for chain in alone:
+            while chain := _left_of(chain, store, failures):
+                if attempt([chain]):
+                    culprit = next(filter(store.is_running, chain), chain[0])
+                    failures[culprit] = _failed(culprit, store, "its worker process was killed twice")
+    return list(failures.values())
 
 
-def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
-    """What is left to compute: each chain is a training and what depends on it, or a cell on its own.
-
-    A training whose dependants are all finished is not asked for again; one whose checkpoints are gone is,
-    if something still depends on it. Long trainings come first.
-    """
-    chains: list[list[Cell]] = []
-    for root in dict.fromkeys(cell.needs or cell for cell in cells):
-        waiting = [cell for cell in cells if cell.needs == root and not store.is_done(cell)]
-        wanted = bool(waiting) if root.kind == "train" else True
-        if wanted and not _is_finished(root, store):
-            waiting.insert(0, root)
-        if waiting:
-            chains.append(waiting)
-
-    def work(chain: list[Cell]) -> int:
-        root = chain[0]
-        if root.kind != "train":
-            return 0
-        seed_steps = root.definition["steps"] * len(root.definition["seeds"])
-        return seed_steps if root.definition["policy"] in STACKED else LEROBOT_TRAIN_SLOWNESS * seed_steps
-
-    return sorted(chains, key=work, reverse=True)
+def _left_of(chain: Sequence[Cell], store: Store, failures: Mapping[Cell, Failure]) -> list[Cell]:
+    """What is still to be computed of a chain, except for what has failed."""
+    if any(cell.kind == "train" and cell in failures for cell in chain):
+        return []
+    return [cell for cell in chain if cell not in failures and not is_finished(cell, store)]
 
 
 def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path]) -> list[Failure]:
@@ -141,26 +155,38 @@ def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path])
 
 
 def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
-    with store.lock(cell) as lock:
-        if _is_finished(cell, store):  # by another command meanwhile
-            return None
-        store.failure_path(cell).unlink(missing_ok=True)
-        start = time.monotonic()
-        try:
+    try:
+        with store.lock(cell) as lock:
+            if is_finished(cell, store):  # by another command meanwhile
+                return None
+            store.failure_path(cell).unlink(missing_ok=True)
+            store.running_path(cell).touch()
+            start = time.monotonic()
             with (
                 store.log_path(cell).open("a") as log,
                 contextlib.redirect_stdout(log),
                 contextlib.redirect_stderr(log),
             ):
                 result = _compute(cell, store, dataset, lock)
-        except Exception as error:
-            with store.log_path(cell).open("a") as log:
-                traceback.print_exc(file=log)
-            message = f"{type(error).__name__}: {error}"
-            write_text(store.failure_path(cell), message + "\n")
-            return Failure(cell, message, store.log_path(cell))
-        store.write(cell, result, time.monotonic() - start)
-        return None
+            store.write(cell, result, time.monotonic() - start)
+            store.running_path(cell).unlink(missing_ok=True)
+            return None
+    except Exception as error:
+        return _failed(cell, store, f"{type(error).__name__}: {error}", traceback.format_exc())
+
+
+def _failed(cell: Cell, store: Store, message: str, details: str = "") -> Failure:
+    """Note a failure; where even that cannot be written (disk full), the command still names it."""
+    with contextlib.suppress(OSError):
+        store.running_path(cell).unlink(missing_ok=True)
+        write_text(store.failure_path(cell), message + "\n")
+        with store.log_path(cell).open("a") as log:
+            log.write(details or message + "\n")
+    return Failure(cell, message, store.log_path(cell))
+
+
+def _stored_failure(cell: Cell, store: Store) -> Failure:
+    return Failure(cell, store.failure_path(cell).read_text().strip(), store.log_path(cell))
 
 
 def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, Any]:
@@ -173,22 +199,6 @@ def _compute(cell: Cell, store: Store, dataset: Path, lock: int) -> dict[str, An
     if cell.kind == "styles":
         return compute_style_map(cell, store, dataset)
     return compute_similarity(cell, dataset)
-
-
-def format_states(cells: Sequence[Cell], store: Store) -> str:
-    """A table for the terminal: what is done, failed or waiting."""
-    rows = [(store.state(cell), str(cell.labels)) for cell in cells]
-    counts = {state: sum(s == state for s, _ in rows) for state in ("done", "failed", "waiting")}
-    lines = [f"{state:<8} {name}" for state, name in rows]
-    return "\n".join([*lines, ", ".join(f"{count} {state}" for state, count in counts.items())])
-
-
-def _is_finished(cell: Cell, store: Store) -> bool:
-    """Whether the result and, of a training, its checkpoints are there."""
-    if cell.kind != "train":
-        return store.is_done(cell)
-    folders = [checkpoint_folder(cell, store, seed) for seed in cell.definition["seeds"]]
-    return store.is_done(cell) and all(folder.is_dir() for folder in folders)
 
 
 def _check_policies(settings: ReproductionSettings) -> None:
@@ -214,32 +224,3 @@ def _write_manifest(
         "cells": [store.result_path(cell).name for cell in cells],
     }
     write_text(store.root / "suites" / f"{suite}.json", json.dumps(content, indent=1) + "\n")
-
-
-@contextlib.contextmanager
-def _progress(cells: Sequence[Cell], store: Store) -> Iterator[None]:
-    """A bar over the cells, fed from what they have written, whoever computes them."""
-    finished = threading.Event()
-    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout) as bar:
-
-        def watch() -> None:
-            while True:
-                last = finished.wait(2.0)
-                bar.n = round(sum(_share_done(cell, store) for cell in cells), 1)
-                bar.refresh()
-                if last:
-                    return
-
-        watcher = threading.Thread(target=watch, daemon=True)
-        watcher.start()
-        try:
-            yield
-        finally:
-            finished.set()
-            watcher.join()
-
-
-def _share_done(cell: Cell, store: Store) -> float:
-    if store.is_done(cell):
-        return 1.0
-    return steps_done(cell, store) if cell.kind == "train" else 0.0

@@ -1,6 +1,6 @@
 """Pictures of the report, drawn from stored results alone."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from lerobot_swr.evaluation.plots import (
 from lerobot_swr.reproduction.demonstrations import environment
 from lerobot_swr.reproduction.stored_results import DatasetDescription, StoredCell
 from lerobot_swr.reproduction.suites import LENGTH_BAND
-from lerobot_swr.reproduction.summary import Rate, Summary, length_control
+from lerobot_swr.reproduction.summary import length_control
 
 Paths = list[tuple[np.ndarray, str]]
 
@@ -29,9 +29,7 @@ Paths = list[tuple[np.ndarray, str]]
 def plot_paths(path: Path, demonstrations: DatasetDescription, cells: Sequence[StoredCell]) -> None:
     """Demonstrations, and the first seed's rollouts of every policy, coloured by behaviour."""
     panels = {cell.labels.policy: rollout_paths(cell) for cell in cells}
-    plot_comparison(
-        path, demonstration_paths(demonstrations), panels, environment(dict(demonstrations.env)), ""
-    )
+    plot_comparison(path, demonstration_paths(demonstrations), panels, environment(demonstrations.env), "")
 
 
 def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Sequence[StoredCell]) -> None:
@@ -48,6 +46,8 @@ def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Seque
         axes.set(xlabel="")
         if cell is not cells[0]:
             axes.get_legend().remove()
+        if axes.get_subplotspec().colspan.start > 0:
+            axes.set_ylabel("")
     for axes in grid:
         axes.set_axis_off()
     _save(figure, path)
@@ -62,55 +62,9 @@ def plot_result(path: Path, demonstrations: DatasetDescription, cell: StoredCell
         shown,
         demonstrations.histogram,
         histogram([label for _, label in shown]),
-        environment(dict(demonstrations.env)),
+        environment(demonstrations.env),
         "",
     )
-
-
-def plot_perturbations(path: Path, cells: Sequence[StoredCell]) -> None:
-    """Success, style match and L1 over the size of the perturbation, a line per policy."""
-    policies = list(dict.fromkeys(cell.labels.policy for cell in cells))
-    measures: dict[str, Callable[[Summary], tuple[float, float, float] | None]] = {
-        "success": lambda s: _mean_and_interval(s.success),
-        "style match": lambda s: None if s.fidelity is None else _mean_and_interval(s.fidelity),
-        "L1 (each style once)": lambda s: (s.l1, s.l1_interval.low, s.l1_interval.high),
-    }
-    perturbations: dict[str, Callable[[Mapping], float | None]] = {
-        "half-width of the start square (share of the side)": _start_radius,
-        "standard deviation of the noise (largest steps)": _noise,
-    }
-    figure = Figure(figsize=(12, 6.4), layout="constrained")
-    grid = figure.subplots(len(perturbations), len(measures), squeeze=False)
-    for row, (x_label, size) in zip(grid, perturbations.items(), strict=True):
-        for axes, (y_label, measure) in zip(row, measures.items(), strict=True):
-            for i, policy in enumerate(policies):
-                points = []
-                for cell in cells:
-                    x = size(cell.definition["env"])
-                    y = measure(cell.best)
-                    if cell.labels.policy == policy and x is not None and y is not None:
-                        points.append((x, *y))
-                if points:
-                    x_values, y_values, low, high = np.array(sorted(points)).T
-                    axes.plot(x_values, y_values, "o-", color=f"C{i}", label=policy, markersize=4)
-                    axes.fill_between(x_values, low, high, color=f"C{i}", alpha=0.15, linewidth=0)
-            axes.set(xlabel=x_label, ylabel=y_label, ylim=(0, 2) if y_label.startswith("L1") else (0, 1.02))
-    grid[0, 0].legend(fontsize=8)
-    _save(figure, path)
-
-
-def _mean_and_interval(rate: Rate) -> tuple[float, float, float]:
-    return rate.mean, rate.interval.low, rate.interval.high
-
-
-def _start_radius(env: Mapping) -> float | None:
-    if env.get("transition_noise", 0.0) or env.get("start") == "random":
-        return None
-    return env["start_radius"] if env.get("start") == "pseudo_random" else 0.0
-
-
-def _noise(env: Mapping) -> float | None:
-    return None if env.get("start", "fixed") != "fixed" else env.get("transition_noise", 0.0)
 
 
 def plot_control(path: Path, demonstrations: DatasetDescription, cells: Sequence[StoredCell]) -> None:
@@ -158,7 +112,7 @@ def plot_dissimilarity(path: Path, demonstrations: DatasetDescription, cell: Sto
     panels = np.atleast_1d(figure.subplots(1, len(references)))
     colors = colormaps["viridis_r"]
     for axes, reference, nu in zip(panels, references, cell.result["nu"], strict=True):
-        environment(dict(demonstrations.env)).draw_scene(axes)
+        environment(demonstrations.env).draw_scene(axes)
         paths = dict(zip(demonstrations.result["path_episodes"], demonstrations.result["paths"], strict=True))
         for episode in sorted(paths, key=lambda i: -nu[i]):  # the similar ones on top
             axes.plot(*np.array(paths[episode]).T, color=colors(nu[episode]), linewidth=0.9)
@@ -181,7 +135,7 @@ def plot_input_distributions(path: Path, demonstrations: DatasetDescription, cel
         axes.imshow(
             grid, origin="lower", extent=(0, 1, 0, 1), cmap="magma_r", norm=PowerNorm(0.5, 0, grid.max())
         )
-        environment(dict(demonstrations.env)).draw_scene(axes)
+        environment(demonstrations.env).draw_scene(axes)
         axes.set(title=f"β = {float(beta):g}", xticks=[], yticks=[], aspect="equal")
     _save(figure, path)
 
@@ -208,7 +162,7 @@ def plot_style_maps(path: Path, demonstrations: DatasetDescription, cells: Seque
 
 def plot_sweep(path: Path, cells: Sequence[StoredCell]) -> None:
     """Effect of β (at one p) and of p (at one β) on L1, success and style fidelity."""
-    options = [cell.training["options"] for cell in cells if cell.training is not None]
+    options = [cell.training["config"] for cell in cells if cell.training is not None]
     figure = Figure(figsize=(12, 3.8), layout="constrained")
     for axes, name, other in zip(figure.subplots(1, 2), ("beta", "p"), ("p", "beta"), strict=True):
         values = [o[other] for o in options]
@@ -217,7 +171,8 @@ def plot_sweep(path: Path, cells: Sequence[StoredCell]) -> None:
         chosen.sort(key=lambda pair: pair[0])
         _draw_sweep(axes, [str(f"{x:g}") for x, _ in chosen], [cell for _, cell in chosen])
         symbols = {"beta": "β", "p": "p"}
-        axes.set(xlabel=f"{symbols[name]} ({symbols[other]} = {fixed:g})", ylim=(0, 1.25))
+        axes.set_xlabel(f"{symbols[name]} ({symbols[other]} = {fixed:g})")
+        axes.set_ylim(bottom=0)
     _save(figure, path)
 
 

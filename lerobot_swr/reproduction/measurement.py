@@ -8,17 +8,25 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import path_of
-from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.checkpoint import (
+    Checkpoint,
+    DatasetSource,
+    load_checkpoint,
+    load_demonstrations,
+    load_reference,
+)
+from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import environment, short_path
+from lerobot_swr.reproduction.settings import MAX_ROLLOUTS
 from lerobot_swr.reproduction.training import checkpoint_folder
 
 BATCH_SIZE = 100  # environments that run at once
 
 
 def measure(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]:
-    """Roll out every seed of the cell's training.
+    """Roll out every seed of the cell's training, or of a baseline that needs none.
 
     The rollouts of each seed and way of drawing are kept as soon as they are made, so that an interrupted
     cell goes on with the next ones.
@@ -32,9 +40,9 @@ def measure(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]:
         The result: ``rollouts[seed][protocol]`` with one list per figure, ``allowed`` (the episodes whose
         styles could be drawn; None: all or no styles) and ``paths`` of the first seed's last rollouts.
     """
-    assert cell.needs is not None
+    seeds = (cell.needs or cell).definition["seeds"]
     result: dict[str, Any] = {"rollouts": {}, "allowed": None, "paths": []}
-    for seed in cell.needs.definition["seeds"]:
+    for seed in seeds:
         result["rollouts"][str(seed)] = {}
         for protocol in cell.definition["protocols"]:
             path = store.work_folder(cell) / "parts" / f"seed_{seed}-{protocol}.json"
@@ -43,23 +51,26 @@ def measure(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]:
             part = json.loads(path.read_text())
             result["rollouts"][str(seed)][protocol] = part["rollouts"]
             result["allowed"] = part["allowed"]
-            if seed == cell.needs.definition["seeds"][0]:
+            if seed == seeds[0]:
                 result["paths"] = part["paths"]
     return result
 
 
 def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> dict[str, Any]:
-    assert cell.needs is not None
-    definition = cell.definition
-    checkpoint = load_policy(checkpoint_folder(cell.needs, store, seed), protocol, definition["style_filter"])
-    # refuses another dataset than the training's
-    trajectories = load_reference(DatasetSource(root=dataset), checkpoint)
+    definition, source = cell.definition, DatasetSource(root=dataset)
+    if cell.needs is None:
+        trajectories = load_demonstrations(source.metadata())
+        checkpoint = playback_checkpoint(trajectories, protocol)  # type: ignore[arg-type]
+    else:
+        folder = checkpoint_folder(cell.needs, store, seed)
+        checkpoint = load_policy(folder, protocol, definition["style_filter"])
+        # refuses another dataset than the training's
+        trajectories = load_reference(source, checkpoint)
     env_cfg = environment(definition["env"])
     rule = env_cfg.behavior_rule()
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     count = definition["protocols"][protocol]
-    # Rollout k of a training seed meets the same start and noise whatever the policy.
-    env_seed = definition["seed"] * (seed + 1)
+    env_seed = environment_seed(definition["seed"], seed)
     rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed)
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
@@ -68,6 +79,15 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
         "paths": [short_path(path_of(env_cfg, rollout.observations)) for rollout in drawn],
     }
+
+
+def environment_seed(first: int, training_seed: int) -> int:
+    """Seed of a training seed's first rollout, the next ones count on from it.
+
+    Rollout k of a training seed meets the same start and noise whatever the policy; no two training seeds
+    share a start or noise.
+    """
+    return first + training_seed * MAX_ROLLOUTS
 
 
 def load_policy(folder: Path, style_sampling: str | None, style_filter: str | None) -> Checkpoint:

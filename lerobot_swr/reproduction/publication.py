@@ -70,7 +70,7 @@ def update_readme(readme: Path, root: Path) -> None:
     write_text(readme, with_block(readme.read_text(encoding="utf-8"), readme_block(root), readme))
     suite = load_suites(root)["table1"]
     dataset, policy = PICTURED
-    pictured = [cell for cell in suite.evaluations(dataset) if cell.labels.policy == policy]
+    pictured = [cell for cell in suite.evaluations(dataset) if cell.policy == policy]
     if pictured:
         figures.plot_result(root / PICTURE, suite.datasets[dataset], pictured[0])
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_swr.evaluation.report import Picture, Section, write_report
-from lerobot_swr.reproduction import figures, tables
+from lerobot_swr.reproduction import contracting_tables, figures, tables
 from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.paper import SOURCE
+from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults, load_suites
 
 INTRODUCTION = (
@@ -36,7 +37,13 @@ def write_results_report(root: Path) -> Path:
     """
     suites = load_suites(root)
     pictures = root / "figures"
-    build = {"table1": _diversity, "robustness": _robustness, "control": _control, "figures": _figures}
+    build = {
+        "table1": _diversity,
+        "robustness": _robustness,
+        "contracting": _contracting,
+        "control": _control,
+        "figures": _figures,
+    }
     sections = [
         section
         for name, make in build.items()
@@ -85,7 +92,7 @@ def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
 
 
 def _baseline_note(suite: SuiteResults, dataset: str) -> list[str]:
-    others = [c for c in suite.evaluations(dataset) if c.labels.policy not in ("bc", "zbc", "wzbc")]
+    others = [c for c in suite.evaluations(dataset) if c.policy not in ("bc", "zbc", "wzbc")]
     if not others:
         return []
     names = ", ".join(c.labels.policy for c in others)
@@ -101,7 +108,7 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
         if not cells:
             continue
         curves = pictures / f"robustness-{name}.png"
-        figures.plot_perturbations(curves, cells)
+        plot_perturbations(curves, cells, ("success", "style match", "L1 (each style once)"))
         teaching = suite.of_kind("similarity", name)
         yield Section(
             f"Robustness: {name}",
@@ -112,13 +119,46 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             ],
             [
                 Picture(
-                    "Success, style match and L1 over the half-width of the square of starts (top) and the "
-                    "noise on every step (bottom), each style once; shaded: 95 % intervals as in the table. "
+                    f"{name}: success, style match and L1 over the half-width of the starts' square (top) "
+                    "and the noise on every step (bottom), each style once; bars: 95 % intervals as in the "
+                    "table. "
                     f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
                     curves,
                 )
             ],
             [_who_teaches(cell) for cell in teaching],
+        )
+
+
+def _contracting(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name in suite.datasets:
+        cells = suite.evaluations(name)
+        if not cells:
+            continue
+        curves = pictures / f"contracting-{name}.png"
+        measures = ("success", "style match", "median length error (steps)")
+        has_curves = plot_perturbations(curves, cells, measures)
+        yield Section(
+            f"Contracting styles: {name}",
+            [contracting_tables.unperturbed(suite, name), *contracting_tables.by_condition(suite, name)],
+            [
+                Picture(
+                    f"{name}: success, style match and length error over the size of each perturbation, each "
+                    "style equally often; bars: 95 % intervals as in the tables. "
+                    f"{cells[0].best.n_seeds} seeds × {cells[0].best.n_rollouts} rollouts per point.",
+                    curves,
+                )
+            ]
+            if has_curves
+            else [],
+            [
+                "Beyond the paper. zbc and wzbc are the paper's; corrective=noise and corrective=demos also "
+                "teach every style the way back to its demonstration, from states with noise or those of "
+                "other demonstrations. All are trained with the same steps and batches. Playback with "
+                "feedback has no policy: it plays the demonstration back that a policy would take its style "
+                "from, and corrects deviations as the corrective labels do; it needs the demonstrations when "
+                "it acts. Its seeds are those of starts and noise, the same as for the policies."
+            ],
         )
 
 

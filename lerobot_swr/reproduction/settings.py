@@ -5,14 +5,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-SUITES = ("table1", "robustness", "control", "figures")
+SUITES = ("table1", "robustness", "contracting", "control", "figures")
+MAX_ROLLOUTS = 100_000  # per training seed: how far apart the environments' seeds of training seeds lie
 
 
 @dataclass
 class ReproductionSettings:
     """Options of ``lerobot-swr-reproduce``."""
 
-    # table1, robustness, control, figures, or all of them.
+    # table1, robustness, contracting, control, figures, or all of them.
     suite: str = "all"
     # Training steps of bc, zbc and wzbc. The paper's.
     steps: int = 100_000
@@ -68,6 +69,8 @@ class ReproductionSettings:
         ):
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+        if self.n_rollouts > MAX_ROLLOUTS:
+            raise ValueError(f"n_rollouts={self.n_rollouts}: expected at most {MAX_ROLLOUTS:,}")
         if self.jobs is not None and self.jobs == 0:
             raise ValueError("jobs=0: expected a number of processes, or -1 for all cores")
         for key in ("datasets", "policies"):

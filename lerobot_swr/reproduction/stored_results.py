@@ -58,6 +58,11 @@ class StoredCell:
     demonstrations: DatasetDescription
     training: Mapping[str, Any] | None
 
+    @property
+    def policy(self) -> str:
+        """Type of the policy, without what differs from its usual options."""
+        return self.labels.policy.split(" ")[0]
+
     @cached_property
     def protocols(self) -> list[str]:
         """Ways of drawing styles that an evaluation has, the last one the better one to compare with."""
@@ -66,8 +71,9 @@ class StoredCell:
     @cached_property
     def summaries(self) -> dict[str, Summary]:
         """Of an evaluation, by way of drawing styles."""
-        demonstrated = self.demonstrations.result["behavior"]
-        return {protocol: summarize(self.result, protocol, demonstrated) for protocol in self.protocols}
+        described = self.demonstrations.result
+        labels, steps = described["behavior"], described["steps_to_end"]
+        return {protocol: summarize(self.result, protocol, labels, steps) for protocol in self.protocols}
 
     @property
     def best(self) -> Summary:

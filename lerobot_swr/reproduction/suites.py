@@ -1,19 +1,14 @@
 """The paper's experiments as lists of cells: what is compared is fixed here, before any training."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from typing import Any
 
-import draccus
-from lerobot.configs import PreTrainedConfig
-
-from lerobot_swr.reproduction.baselines import BASELINES, known_policies
+from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations
+from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.experiments import evaluation, playback, training
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
-
-EVALUATION_SEED = 1000
 
 TABLE1_DATASETS = (
     "medium_maze-one_side",
@@ -25,14 +20,26 @@ TABLE1_DATASETS = (
 )
 # Beyond the paper's only_forward, two datasets whose demonstrations of one behaviour cover more of the maze.
 ROBUSTNESS_DATASETS = ("medium_maze-only_forward", "medium_maze-one_side", "medium_maze-spread_out")
+CONTRACTING_DATASETS = (
+    "medium_maze-only_forward",
+    "medium_maze-spread_out",
+    "d3il_avoiding",
+    "d3il_aligning",
+)
 CONTROL_DATASETS = ("medium_maze-only_fast",)
 FIGURES_DATASETS = ("medium_maze-only_forward",)
 DATASETS = {
     "table1": TABLE1_DATASETS,
     "robustness": ROBUSTNESS_DATASETS,
+    "contracting": CONTRACTING_DATASETS,
     "control": CONTROL_DATASETS,
     "figures": FIGURES_DATASETS,
 }
+
+Conditions = dict[str, tuple[dict[str, Any], tuple[str, ...]]]
+"""Name to the options of the environment and the ways of drawing styles."""
+
+BOTH_PROTOCOLS = ("uniform", "stratified")
 
 # --- Robustness (the paper's Table 2) ---
 CONDITIONS: dict[str, dict[str, Any]] = {
@@ -44,7 +51,16 @@ CONDITIONS: dict[str, dict[str, Any]] = {
 START_RADII = (0.05, 0.10, 0.15, 0.20)
 NOISE_LEVELS = (0.5, 1.0, 1.5, 2.0)
 # WZBC with other beta and p: see docs/reproduction.md on why the paper's values teach so little here.
-ROBUST_WZBC = ({"p": 0.95}, {"beta": 3.0})
+ROBUST_WZBC: tuple[dict[str, Any], ...] = ({"p": 0.95}, {"beta": 3.0})
+ROBUST_WZBC_DATASETS = ("medium_maze-spread_out",)
+
+# --- Contracting styles: beyond the paper, docs/contracting.md ---
+UNPERTURBED = "deterministic"
+STICKY_WALLS: dict[str, dict[str, Any]] = {
+    "sticky walls": {"sticky_walls": True},
+    "sticky walls, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
+}
+CORRECTIVE = ("noise", "demos")
 
 # --- Control ---
 LENGTH_BAND = (70, 80)
@@ -59,107 +75,15 @@ PAPER_BETA, PAPER_P = 10.0, 0.8
 
 def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[Demonstrations]) -> list[Cell]:
     """The cells of a suite on some datasets, those that depend on a training after it."""
-    build = {"table1": _table1, "robustness": _robustness, "control": _control, "figures": _figures}[suite]
-    cells = [cell for demos in datasets for cell in build(settings, demos)]
+    build = {
+        "table1": _table1,
+        "robustness": _robustness,
+        "contracting": _contracting,
+        "control": _control,
+        "figures": _figures,
+    }
+    cells = [cell for demos in datasets for cell in build[suite](settings, demos)]
     return list(dict.fromkeys(cell for one in cells for cell in (one.needs, one) if cell is not None))
-
-
-def training(
-    settings: ReproductionSettings,
-    demos: Demonstrations,
-    policy: str,
-    options: Mapping[str, Any] | None = None,
-    steps: int | None = None,
-    seeds: int | None = None,
-) -> Cell:
-    """A training cell.
-
-    Args:
-        settings: Steps, seeds and options.
-        demos: The dataset.
-        policy: Type of the policy.
-        options: Options beyond the settings'; they become part of the policy's name.
-        steps: Instead of the settings'.
-        seeds: Instead of the settings'.
-    """
-    if policy in STACKED:
-        all_options = {**settings.policy_options, **(options or {})}
-        batch_size, default_steps, default_seeds = settings.batch_size, settings.steps, settings.seeds
-    else:
-        baseline = BASELINES[policy]
-        all_options, batch_size = dict(baseline.options), baseline.batch_size
-        default_steps, default_seeds = getattr(settings, baseline.steps), settings.baseline_seeds
-    make = PreTrainedConfig.get_choice_class(policy)
-    unknown = sorted(all_options.keys() - {option.name for option in fields(make)})
-    if unknown:
-        raise ValueError(
-            f"policy_options={dict(settings.policy_options)}: {policy!r} has no option {unknown[0]!r}; "
-            "choose the policies that have it with --policies=[...]"
-        )
-    config = make(device="cpu", push_to_hub=False, **all_options)
-    definition = {
-        "fingerprint": demos.fingerprint,
-        "policy": policy,
-        "options": all_options,
-        # Whole, so that a default that changes with the package makes another cell.
-        "config": draccus.encode(config, PreTrainedConfig),
-        "batch_size": batch_size,
-        "steps": steps or default_steps,
-        "seeds": list(range(seeds or default_seeds)),
-    }
-    return Cell("train", Labels(demos.name, variant_name(policy, options or {}), "training"), definition)
-
-
-def variant_name(policy: str, options: Mapping[str, Any]) -> str:
-    """A policy's name with what differs from its defaults."""
-    values = {key: f"{value:g}" if isinstance(value, float) else value for key, value in options.items()}
-    return " ".join([policy, *(f"{key}={value}" for key, value in values.items())])
-
-
-def evaluation(
-    settings: ReproductionSettings,
-    demos: Demonstrations,
-    trained: Cell,
-    condition: str,
-    env: Mapping[str, Any] | None = None,
-    protocols: Sequence[str] = ("uniform", "stratified"),
-    style_filter: str | None = None,
-    paths: bool = False,
-) -> Cell:
-    """An evaluation cell on a training.
-
-    Args:
-        settings: Number of rollouts.
-        demos: The dataset.
-        trained: The training cell.
-        condition: How it is called.
-        env: Options of the environment beyond its type and task.
-        protocols: Ways of drawing styles; policies without styles are rolled out once.
-        style_filter: Only styles of demonstrations that match.
-        paths: Keep the paths of the first seed's last rollouts, for pictures.
-    """
-    has_styles = hasattr(PreTrainedConfig.get_choice_class(trained.definition["policy"]), "style_sampling")
-    counts = {
-        protocol: _stratified_rollouts(settings.n_rollouts, len(demos.lengths))
-        if protocol == "stratified"
-        else settings.n_rollouts
-        for protocol in (protocols if has_styles else ("uniform",))
-    }
-    definition = {
-        "env": {**demos.env, **(env or {})},
-        "protocols": counts,
-        "style_filter": style_filter,
-        "seed": EVALUATION_SEED,
-        "paths": paths,
-    }
-    return Cell("evaluate", Labels(demos.name, trained.labels.policy, condition), definition, trained)
-
-
-def _stratified_rollouts(n_rollouts: int, n_demonstrations: int) -> int:
-    """As many as asked for, or fewer so that every style is used equally often."""
-    if n_demonstrations > n_rollouts:
-        return n_rollouts
-    return n_rollouts - n_rollouts % n_demonstrations
 
 
 def _table1(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
@@ -170,24 +94,60 @@ def _table1(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[C
 def _robustness(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
     if demos.env["type"] != "maze2d":
         raise ValueError(f"datasets: {demos.name!r} is no maze; robustness perturbs mazes only")
-    trained = [training(settings, demos, policy) for policy in settings.choose_policies(STACKED)]
+    trained = {training(settings, demos, policy): True for policy in settings.choose_policies(STACKED)}
+    variants = ROBUST_WZBC if demos.name in ROBUST_WZBC_DATASETS else ()
     if "wzbc" in settings.choose_policies(STACKED):
-        trained += [training(settings, demos, "wzbc", options) for options in ROBUST_WZBC]
-    for one in trained:
-        in_table1 = one.labels.policy in STACKED
-        for name, env in CONDITIONS.items():
-            paths = in_table1 and name == "deterministic"  # the same cell
-            yield evaluation(settings, demos, one, name, env, paths=paths)
-        for radius in START_RADII:
-            env = {"start": "pseudo_random", "start_radius": radius}
-            if env != CONDITIONS["pseudo-random start"]:
-                yield evaluation(settings, demos, one, f"start radius {radius:g}", env, ("stratified",))
-        for level in NOISE_LEVELS:
-            env = {"transition_noise": level}
-            if env != CONDITIONS["transition noise"]:
-                yield evaluation(settings, demos, one, f"noise {level:g}", env, ("stratified",))
-    values = [{"beta": PAPER_BETA, "p": PAPER_P, **options} for options in ({}, *ROBUST_WZBC)]
+        trained |= {training(settings, demos, "wzbc", options): False for options in variants}
+    for one, in_table1 in trained.items():
+        for name, (env, protocols) in _maze_conditions().items():
+            paths = in_table1 and name == UNPERTURBED  # the same cell
+            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
+    values = [{"beta": PAPER_BETA, "p": PAPER_P, **options} for options in ({}, *variants)]
     yield _similarity(demos, (), [(v["beta"], v["p"]) for v in values])
+
+
+def _maze_conditions() -> Conditions:
+    """The paper's conditions, drawn both ways, and the other points of the curves."""
+    curves: dict[str, dict[str, Any]] = {
+        **{f"start radius {r:g}": {"start": "pseudo_random", "start_radius": r} for r in START_RADII},
+        **{f"noise {level:g}": {"transition_noise": level} for level in NOISE_LEVELS},
+    }
+    conditions = {name: (env, BOTH_PROTOCOLS) for name, env in CONDITIONS.items()}
+    known = list(CONDITIONS.values())
+    return {**conditions, **_stratified({name: env for name, env in curves.items() if env not in known})}
+
+
+def _stratified(conditions: Mapping[str, dict[str, Any]]) -> Conditions:
+    return {name: (env, ("stratified",)) for name, env in conditions.items()}
+
+
+def perturbations(demos: Demonstrations) -> Conditions:
+    """The conditions of the suite ``contracting``, the environment as it is first.
+
+    Raises:
+        ValueError: If the dataset's environment has none.
+    """
+    if demos.env["type"] == "maze2d":
+        return {**_maze_conditions(), **_stratified(STICKY_WALLS)}
+    offered = environment(demos.env).perturbations()
+    if not offered:
+        raise ValueError(f"datasets: {demos.name!r}: its environment names no perturbations")
+    return {UNPERTURBED: ({}, BOTH_PROTOCOLS), **_stratified(offered)}
+
+
+def _contracting(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
+    chosen = settings.choose_policies(("zbc", "wzbc"))
+    if not chosen:
+        return
+    trained = {training(settings, demos, policy): True for policy in chosen}
+    if "zbc" in chosen:
+        trained |= {training(settings, demos, "zbc", {"corrective": kind}): False for kind in CORRECTIVE}
+    for one, in_table1 in trained.items():
+        for name, (env, protocols) in perturbations(demos).items():
+            paths = in_table1 and name == UNPERTURBED  # the same cell
+            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
+    for name, (env, protocols) in perturbations(demos).items():
+        yield playback(settings, demos, name, env, protocols)
 
 
 def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:

@@ -16,6 +16,7 @@ from lerobot_swr.evaluation.metrics import (
     l1_distance,
     l1_floor,
     l1_interval,
+    median_interval,
     success_interval,
 )
 
@@ -50,6 +51,9 @@ class Summary:
         l1_by_seed: Of each seed.
         floor: What perfect reproducers would score as the mean over as many seeds.
         success: Share of successes.
+        length_error: Median difference in length to the style's demonstration, in steps, of successful
+            rollouts with its behaviour; None without any.
+        length_error_interval: Its 95 % bootstrap interval.
         fidelity: Share of rollouts that show their style's demonstration's behaviour (in a maze: those of its
             doors that lie ahead of the start); None without styles.
         coverage: Mean over seeds of the share of the demonstrated behaviours that were shown.
@@ -65,19 +69,27 @@ class Summary:
     l1_by_seed: list[float]
     floor: Floor
     success: Rate
+    length_error: float | None
+    length_error_interval: Interval | None
     fidelity: Rate | None
     coverage: float
     histogram: Histogram
     outcomes: list[np.ndarray]
 
 
-def summarize(result: Mapping[str, Any], protocol: str, demonstrated: Sequence[str]) -> Summary:
+def summarize(
+    result: Mapping[str, Any],
+    protocol: str,
+    demonstrated: Sequence[str],
+    demonstrated_steps: Sequence[int] | None = None,
+) -> Summary:
     """Summarise an evaluation cell's result.
 
     Args:
         result: Of the cell.
         protocol: One that the cell has.
         demonstrated: The label of every demonstration.
+        demonstrated_steps: The steps of every demonstration to its end; None leaves the length error out.
     """
     parts = [by_protocol[protocol] for by_protocol in result["rollouts"].values()]
     labels = [part["behavior"] for part in parts]
@@ -85,6 +97,14 @@ def summarize(result: Mapping[str, Any], protocol: str, demonstrated: Sequence[s
     l1_by_seed = [l1_distance(histogram(shown), reference) for shown in labels]
     allowed = result["allowed"]
     styled = all(part["match"][0] is not None for part in parts)
+    length_errors = [
+        abs(length - demonstrated_steps[style])
+        for part in parts
+        for length, style, success, match in zip(
+            part["length"], part["style"], part["success"], part["match"], strict=True
+        )
+        if demonstrated_steps is not None and style is not None and success and match
+    ]
     matches = [[int(bool(match)) for match in part["match"]] for part in parts]
     return Summary(
         protocol=protocol,
@@ -101,6 +121,8 @@ def summarize(result: Mapping[str, Any], protocol: str, demonstrated: Sequence[s
             n_averaged=len(parts),
         ),
         success=rate([part["success"] for part in parts]),
+        length_error=float(np.median(length_errors)) if length_errors else None,
+        length_error_interval=median_interval(length_errors) if length_errors else None,
         fidelity=rate(matches) if styled else None,
         coverage=float(np.mean([coverage(shown, reference) for shown in labels])),
         histogram=histogram([label for shown in labels for label in shown]),

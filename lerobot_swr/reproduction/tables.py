@@ -13,7 +13,8 @@ from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval,
 NOTHING = "–"
 
 INTERVALS = (
-    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
+    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts; resampling adds noise, so near 0 "
+    "it leans upwards and may leave the mean out]. Floor: what perfect reproducers "
     "would score as the mean over as many seeds [central 95 %]; * L1 uniform lies outside of it. "
     "Success and style fidelity: over all rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
@@ -73,7 +74,7 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
                 rollouts(uniform),
                 l1(uniform),
                 floor(uniform),
-                number(paper.TABLE1_L1.get((dataset, cell.labels.policy))),
+                number(paper.TABLE1_L1.get((dataset, cell.policy))),
                 l1(stratified),
                 NOTHING if stratified is None else f"{stratified.floor.mean:.3f}",
                 share(cell.best.success),
@@ -147,11 +148,13 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
 
 def robustness_differences(suite: SuiteResults, dataset: str) -> Table:
     """Every WZBC against ZBC under the same starts and noise."""
-    cells = {(c.labels.policy, c.labels.condition): c for c in suite.evaluations(dataset)}
+    evaluations = suite.evaluations(dataset)
+    cells = {(c.labels.policy, c.labels.condition): c for c in evaluations}
+    references = {c.labels.condition: c for c in evaluations if c.policy == "zbc"}
     policies = [name for name in dict.fromkeys(name for name, _ in cells) if name.startswith("wzbc")]
     rows = []
     for condition in dict.fromkeys(condition for _, condition in cells):
-        reference = cells.get(("zbc", condition))
+        reference = references.get(condition)
         if reference is not None:
             pairs = [(cells.get((policy, condition)), reference) for policy in policies]
             rows.append((condition, *(_difference(*pair, column) for column in (0, 1) for pair in pairs)))
@@ -172,6 +175,7 @@ def _difference(cell: StoredCell | None, reference: StoredCell, column: int) -> 
     first, second = ([outcomes[:, column] for outcomes in c.best.outcomes] for c in (cell, reference))
     mean, interval = difference_interval(first, second)
     clear = interval.low > 0 or interval.high < 0
+    mean = round(mean, 3) + 0.0  # no -0.000
     return f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}"
 
 
@@ -248,7 +252,7 @@ def sweep(cells: Sequence[StoredCell]) -> Table:
     rows = []
     for cell in cells:
         assert cell.training is not None
-        options = cell.training["options"]
+        options = cell.training["config"]
         rows.append(
             (
                 f"{options['beta']:g}",

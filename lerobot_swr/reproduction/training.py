@@ -11,6 +11,7 @@ from typing import Any
 import yaml
 
 from lerobot_swr.reproduction.cells import Cell, Store
+from lerobot_swr.training.memory import LARGE_PAGES
 
 STACKED = ("bc", "zbc", "wzbc")  # lerobot-swr-train trains all seeds at once, of others one after the other
 CHECKPOINTS = 10  # periodic checkpoints of a training, from which it resumes
@@ -90,12 +91,12 @@ def _run(
 
 
 def _execute(command: Sequence[str], cell: Cell, store: Store, lock: int) -> None:
-    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    settings = {**LARGE_PAGES, **os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
     with store.log_path(cell).open("a") as log:
         log.write(f"$ {' '.join(command)}\n")
         log.flush()
         run = subprocess.run(
-            list(command), stdout=log, stderr=subprocess.STDOUT, env=one_thread, pass_fds=(lock,)
+            list(command), stdout=log, stderr=subprocess.STDOUT, env=settings, pass_fds=(lock,)
         )
     if run.returncode != 0:
         raise ChildProcessError(f"the training of {cell.labels} ended with status {run.returncode}")

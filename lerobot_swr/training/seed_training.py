@@ -1,6 +1,5 @@
 """Trains all seeds of one configuration at once, spread over processes."""
 
-import ctypes
 import logging
 import math
 import multiprocessing
@@ -22,12 +21,11 @@ from tqdm import tqdm
 
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
+from lerobot_swr.training.memory import keep_freed_memory, large_pages
 from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step, point_to_last
 from lerobot_swr.training.separate_training import train_separately
 
 STEPS_AT_ONCE = 64  # whose frames and pairs are drawn together
-
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +79,7 @@ def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps
     ]
     running: list[tuple[list[int], Any]] = []
     total = sum(config.steps - steps[seed] for seeds in groups for seed in seeds)
-    with tqdm(total=total, desc="Training", unit="seed-step") as bar:
+    with tqdm(total=total, desc="Training", unit="seed-step") as bar, large_pages():
         try:
             while waiting or running:
                 while waiting and len(running) < (config.jobs or 1):
@@ -128,7 +126,7 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[],
     """
     # Threads would gain nothing on networks of this size, and their number would change the rounding.
     torch.set_num_threads(1)
-    _keep_freed_memory()
+    keep_freed_memory()
     dataset, _ = make_train_eval_datasets(config.of_seed(seeds[0]))
     runs = SeedRuns(config, seeds, dataset.meta)
     episodes = dataset.meta.episodes
@@ -176,17 +174,6 @@ def _report(seeds: list[int], step: int, losses: list[Tensor], log: bool) -> lis
         listed = ", ".join(f"{seed}: {loss:.4f}" for seed, loss in zip(seeds, means, strict=True))
         logger.info("step %d, mean loss of %d steps by seed: %s", step, len(losses), listed)
     return []
-
-
-def _keep_freed_memory() -> None:
-    """Let freed memory stay with the process where the C library is glibc.
-
-    It would give large blocks back to the system, and every step would have the gradients' pages mapped anew.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
-    if mallopt is not None:
-        mallopt(M_MMAP_THRESHOLD, 32 << 20)
-        mallopt(M_TRIM_THRESHOLD, 512 << 20)
 
 
 def _steps_to_save(config: SeedsTrainConfig, step: int) -> int:

@@ -11,7 +11,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
 from lerobot_swr.policies.modeling_swr import BCPolicy
-from lerobot_swr.training.flat_parameters import FlatParameters
+from lerobot_swr.training.early_updates import EarlyUpdates
+from lerobot_swr.training.parameter_blocks import ParameterBlock
 from lerobot_swr.training.traced_gradients import TracedGradients
 
 
@@ -48,21 +49,24 @@ class StackedPolicies:
         assert config.optimizer is not None
         self.policies = policies
         self._max_norm = config.optimizer.grad_clip_norm
-        self._groups = [FlatParameters(policies, group) for group in _group_names(policies[0], optimizers[0])]
-        self._parameters = {name: value for group in self._groups for name, value in group.stacked.items()}
-        one = _FrameLosses(policies[0])
-
-        def loss(parameters: Mapping[str, Tensor], drawn: Mapping[str, Tensor]) -> Tensor:
-            return functional_call(one, {f"policy.{k}": v for k, v in parameters.items()}, (drawn,))
-
-        self._gradients = TracedGradients(vmap(loss), self._parameters)
+        own = [dict(policy.named_parameters()) for policy in policies]
+        names = _group_names(policies[0], optimizers[0])
+        self._groups = [
+            {name: ParameterBlock([parameters[name] for parameters in own]) for name in group}
+            for group in names
+        ]
+        self._blocks = {name: block for group in self._groups for name, block in group.items()}
         options = [{k: v for k, v in g.items() if k != "params"} for g in optimizers[0].param_groups]
         self.optimizer = config.optimizer.build(
-            [{**o, "params": [group.flat]} for o, group in zip(options, self._groups, strict=True)]
+            [
+                {**o, "params": [block.flat for block in group.values()]}
+                for o, group in zip(options, self._groups, strict=True)
+            ]
         )
         for place, group in enumerate(self._groups):
-            states = [[o.state.get(p, {}) for p in o.param_groups[place]["params"]] for o in optimizers]
-            self.optimizer.state[group.flat].update(group.flatten_state(states))
+            for i, block in enumerate(group.values()):
+                states = [o.state.get(o.param_groups[place]["params"][i], {}) for o in optimizers]
+                self.optimizer.state[block.flat].update(block.stack_state(states))
         self.scheduler: LRScheduler | None = None
         if config.scheduler is not None and scheduler is not None:
             self.scheduler = config.scheduler.build(self.optimizer, config.steps)
@@ -70,6 +74,17 @@ class StackedPolicies:
             self.scheduler.load_state_dict(scheduler.state_dict())
             for options_, rate in zip(self.optimizer.param_groups, scheduler.get_last_lr(), strict=True):
                 options_["lr"] = rate
+        one = _FrameLosses(policies[0])
+
+        def loss(parameters: Mapping[str, Tensor], drawn: Mapping[str, Tensor]) -> Tensor:
+            return functional_call(one, {f"policy.{k}": v for k, v in parameters.items()}, (drawn,))
+
+        stacked = {name: block.stacked for name, block in self._blocks.items()}
+        self._gradients = TracedGradients(vmap(loss), stacked)
+        self._early: EarlyUpdates | None = None
+        if EarlyUpdates.are_possible(self.optimizer) and self._max_norm <= 0:
+            self._early = EarlyUpdates(self.optimizer, self._groups)
+            self._descent = TracedGradients(vmap(loss), stacked, self._early.consume)
 
     def losses_and_gradients(self, drawn: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Each policy's loss and its gradient.
@@ -91,11 +106,16 @@ class StackedPolicies:
         Returns:
             (K,) losses before the step.
         """
-        losses, gradients = self.losses_and_gradients(drawn)
-        for group in self._groups:
-            group.set_gradient(gradients)
-        self._clip_gradients()
-        self.optimizer.step()
+        if self._early is not None:
+            self._early.begin()
+            losses, _ = self._descent(drawn)
+            self._early.finish()
+        else:
+            losses, gradients = self.losses_and_gradients(drawn)
+            for name, block in self._blocks.items():
+                block.flat.grad = block.rows(gradients[name])
+            self._clip_gradients()
+            self.optimizer.step()
         if self.scheduler is not None:
             self.scheduler.step()
         return losses
@@ -104,26 +124,27 @@ class StackedPolicies:
         """Limit the norm of each policy's gradient, as `clip_grad_norm_` does for a single policy."""
         if self._max_norm <= 0:
             return
-        norms = torch.stack([group.gradient.norm(dim=1) for group in self._groups]).norm(dim=0)  # (K,)
+        gradients = [block.flat.grad for block in self._blocks.values() if block.flat.grad is not None]
+        norms = torch.stack([gradient.norm(dim=1) for gradient in gradients]).norm(dim=0)  # (K,)
         if norms.max() <= self._max_norm:
             return
         factors = (self._max_norm / (norms + 1e-6)).clamp(max=1)
-        for group in self._groups:
-            group.gradient.mul_(factors[:, None])
+        for gradient in gradients:
+            gradient.mul_(factors[:, None])
 
     def unstack(self) -> None:
         """Copy the parameters back into the policies."""
         with torch.no_grad():
             for k, policy in enumerate(self.policies):
                 for name, parameter in policy.named_parameters():
-                    parameter.copy_(self._parameters[name][k])
+                    parameter.copy_(self._blocks[name].stacked[k])
 
     def optimizer_state(self, k: int) -> dict[str, Any]:
         """State of policy k's optimizer, as `Optimizer.state_dict` of a single one."""
         states: list[dict[str, Tensor]] = []
         groups = []
         for group, options in zip(self._groups, self.optimizer.state_dict()["param_groups"], strict=True):
-            own = group.unflatten_state(self.optimizer.state[group.flat], k)
+            own = [block.state_of(self.optimizer.state[block.flat], k) for block in group.values()]
             groups.append({**options, "params": list(range(len(states), len(states) + len(own)))})
             states += own
         return {"state": dict(enumerate(states)), "param_groups": groups}
