@@ -1,7 +1,7 @@
 """The baselines beside LeRobot's diffusion (configs/diffusion.yaml): training steps/s and actions/s.
 
-Training is `lerobot-train` with the recipes in configs/ on medium_maze-only_forward, the same batch size for
-all (the baselines noise each window of it `noise_draws` times); loading and updating are told apart.
+Training is the recipes in configs/ on medium_maze-only_forward with the same batch size for all, by
+`lerobot-train` and, with frames in memory, by `lerobot-swr-train`; loading and updating are told apart.
 Inference is one environment step of 100 environments at once, in rounds that take turns.
 """
 
@@ -26,25 +26,30 @@ from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 
 POLICIES = ("ddpm_gpt", "ddpm_act", "beso", "diffusion")
+COMMANDS = {"lerobot-train": (), "lerobot-swr-train": ("--seeds=0", "--jobs=1")}
 CONFIGS = Path(__file__).parent.parent / "configs"
-BATCH, STEPS = 16, 200
+BATCH, STEPS = 64, 100
 N_ENVS, ENV_STEPS, ROUNDS = 100, 16, 5
 
 
-def training(policy_type: str, root: Path, folder: str) -> None:
-    command = [
-        str(Path(sys.executable).with_name("lerobot-train")),
+def training(policy_type: str, command: str, root: Path, folder: str) -> None:
+    flags = [
         f"--config_path={CONFIGS / policy_type}.yaml",
         *(f"--dataset.root={root}", f"--batch_size={BATCH}", f"--steps={STEPS}", f"--log_freq={STEPS // 2}"),
-        *("--save_checkpoint=false", f"--output_dir={folder}/{policy_type}"),
+        f"--output_dir={folder}/{policy_type}-{command}",
     ]
-    run = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "HF_HUB_OFFLINE": "1"})
+    run = subprocess.run(
+        [str(Path(sys.executable).with_name(command)), *flags, *COMMANDS[command]],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"},
+    )
     if run.returncode != 0:
         sys.exit(run.stderr[-3000:])
     timings = re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", run.stdout + run.stderr)
     update, data = (float(value) for value in timings[-1])  # of the second half of the run
     print(
-        f"{policy_type:>9}: {1 / (update + data):6.1f} training steps/s at batch {BATCH} "
+        f"{policy_type:>9}: {1 / (update + data):6.1f} training steps/s at batch {BATCH} by {command} "
         f"(update {1e3 * update:.0f} ms, data {1e3 * data:.0f} ms)",
         flush=True,
     )
@@ -82,7 +87,8 @@ def main() -> None:
         root = Path(folder) / "only_forward"
         write_dataset(get_recipe("medium_maze-only_forward"), root)
         for policy_type in POLICIES:
-            training(policy_type, root, folder)
+            for command in COMMANDS:
+                training(policy_type, command, root, folder)
         inference(LeRobotDatasetMetadata("local/only_forward", root=root))
 
 

@@ -17,6 +17,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_swr.configuration import resuming
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
+from lerobot_swr.training.memory import keep_freed_memory
 from lerobot_swr.training.memory_dataset import frames_in_memory
 
 
@@ -66,6 +67,7 @@ def _train_seed(config: SeedsTrainConfig, seed: int) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     register_third_party_plugins()
     torch.set_num_threads(1)  # several processes share the cores
+    keep_freed_memory()
     run = config.of_seed(seed)
     assert run.output_dir is not None
     with frames_in_memory():

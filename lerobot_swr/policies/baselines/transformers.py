@@ -40,7 +40,8 @@ class Trunk(nn.Module):
 class WindowGPT(nn.Module):
     """A causal transformer over (noise level, observation, action, observation, action, ...).
 
-    An observation and the action taken in it share a learned place embedding.
+    An observation and the action taken in it share a learned place embedding; the first one of the episode, or
+    of the window where that begins later, is at place 0.
 
     Args:
         observation_dim: O.
@@ -78,7 +79,7 @@ class WindowGPT(nn.Module):
             (B, T, A).
         """
         pairs = torch.stack([self.observation(observations), self.action(actions)], dim=2)  # (B, T, 2, W)
-        tokens = (pairs + self.places[:, None]).flatten(1, 2)
+        tokens = (pairs + self.places[places_from_start(observations, is_pad)][:, :, None]).flatten(1, 2)
         tokens = torch.cat([self.level(level)[:, None], tokens], dim=1)  # (B, 1 + 2 T, W)
         if is_pad is not None:
             is_pad = nn.functional.pad(is_pad.repeat_interleave(2, dim=1), (1, 0))
@@ -88,7 +89,8 @@ class WindowGPT(nn.Module):
 class ChunkEncoderDecoder(nn.Module):
     """Encodes (noise level, observations); decodes a chunk of actions with cross-attention.
 
-    The chunk's first action belongs to the last observation and shares its learned place embedding.
+    The chunk's first action belongs to the last observation and shares its learned place embedding; the first
+    observation of the episode, or of the window where that begins later, is at place 0.
 
     Args:
         observation_dim: O.
@@ -122,7 +124,6 @@ class ChunkEncoderDecoder(nn.Module):
         self.observation = nn.Linear(observation_dim, width)
         self.action = nn.Linear(action_dim, width)
         self.places = nn.Parameter(torch.empty(window - 1 + chunk, width))
-        self.window = window
         self.level = level
         self.encoder = encoder
         layer = nn.TransformerDecoderLayer(
@@ -147,12 +148,14 @@ class ChunkEncoderDecoder(nn.Module):
         Returns:
             (B, K, A).
         """
-        tokens = self.observation(observations) + self.places[: self.window]
+        places = places_from_start(observations, is_pad)
+        tokens = self.observation(observations) + self.places[places]
         tokens = torch.cat([self.level(level)[:, None], tokens], dim=1)  # (B, 1 + T, W)
         if is_pad is not None:
             is_pad = nn.functional.pad(is_pad, (1, 0))
         memory = self.encoder(tokens, is_pad)
-        queries = self.action(actions) + self.places[self.window - 1 :]
+        chunk = torch.arange(actions.shape[1], device=actions.device)
+        queries = self.action(actions) + self.places[places[:, -1:] + chunk]
         hidden = self.decoder(
             queries,
             memory,
@@ -193,6 +196,13 @@ class NoiseLevelEmbedding(nn.Module):
     def forward(self, sigma: Tensor) -> Tensor:
         """(B, W) of (B,)."""
         return self.linear(sigma.log()[:, None] / 4)
+
+
+def places_from_start(observations: Tensor, is_pad: Tensor | None) -> Tensor:
+    """(B, T) or (1, T) places of observations (B, T, O): those marked in `is_pad` (B, T) do not count."""
+    if is_pad is None:
+        return torch.arange(observations.shape[1], device=observations.device)[None]
+    return ((~is_pad).cumsum(dim=1) - 1).clamp(min=0)
 
 
 def causal_mask(tokens: Tensor) -> Tensor:
