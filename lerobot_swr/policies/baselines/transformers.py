@@ -40,8 +40,8 @@ class Trunk(nn.Module):
 class WindowGPT(nn.Module):
     """A causal transformer over (noise level, observation, action, observation, action, ...).
 
-    An observation and the action taken in it share a learned place embedding; the first one of the episode, or
-    of the window where that begins later, is at place 0.
+    An observation and the action taken in it share a learned place embedding; the first one of the episode,
+    or of the window where that begins later, is at place 0.
 
     Args:
         observation_dim: O.
