@@ -77,8 +77,8 @@ class ZBCConfig(BCConfig):
     # (its own states with noise; for states of few dimensions) or "demos" (states of other demonstrations).
     corrective: str = "none"
     # How far beside: the largest noise, or the distance at which other demonstrations' states become rare, as
-    # a share of each state dimension's range, in a state of two dimensions; √(2 / d) times that in one of more
-    # dimensions d. More is more robust and keeps the timing less well.
+    # a share of each state dimension's range, in a state of two dimensions; √(2 / d) times that in one of d,
+    # if d > 2. More is more robust and keeps the timing less well.
     corrective_scale: float = 0.1
     # Steps in which a corrective action leads back; null takes them from the data.
     corrective_horizon: int | None = None
