@@ -40,6 +40,6 @@ def refuse_conflicts(given: Collection[str], has_env: bool) -> None:
     useless = [f"--{key}" for key in NEEDS_ENV if key in given]
     if useless and not has_env:
         raise ValueError(
-            f"{', '.join(useless)}: this is about rollouts in an environment; name one with --env.type=..., or "
-            "leave it out to evaluate on the dataset's frames"
+            f"{', '.join(useless)}: this is about rollouts in an environment; name one with --env.type=... "
+            "or leave it out to evaluate on the dataset's frames"
         )
