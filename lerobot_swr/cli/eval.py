@@ -25,6 +25,7 @@ from lerobot.utils.utils import init_logging
 
 from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
+from lerobot_swr.cli.eval_conflicts import refuse_conflicts
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, path_of, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
@@ -48,26 +49,6 @@ from lerobot_swr.evaluation.robustness import format_robustness, run_robustness
 from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactual, plot_length_control
 from lerobot_swr.styles import check_style_sampling
 from lerobot_swr.trajectories import Trajectories
-
-# Flags beside which others have no effect.
-CONFLICTS = {
-    "robustness": ("counterfactual", "blend", "length_band"),
-    "counterfactual": (
-        "length_band",
-        "n_episodes",
-        "style_sampling",
-        "policy.style_sampling",
-        "dataset.episodes",
-    ),
-    "blend": ("length_band", "n_episodes", "style_sampling", "policy.style_sampling", "dataset.episodes"),
-    "length_band": ("dataset.episodes",),
-    "style_sampling": ("policy.style_sampling",),
-    "baseline": ("rename_map", "policy.*"),
-}
-NEEDS_ENV = (
-    *("robustness", "counterfactual", "blend", "length_band"),
-    *("style_sampling", "behavior_rule", "n_episodes"),
-)
 
 
 @dataclass
@@ -145,16 +126,7 @@ class EvalCommand:
             "policy.style_sampling": any(o.startswith("--style_sampling") for o in _policy_overrides()),
             "policy.*": self.policy is not None or bool(_policy_overrides()),
         }
-        for first, others in CONFLICTS.items():
-            for second in others:
-                if given[first] and given[second]:
-                    raise ValueError(f"--{first} and --{second} exclude each other: leave out one of them")
-        useless = [key for key in NEEDS_ENV if given[key]]
-        if self.env is None and useless:
-            raise ValueError(
-                f"{', '.join(f'--{key}' for key in useless)}: this is about rollouts in an environment; "
-                "name one with --env.type=..., or leave it out to evaluate on the dataset's frames"
-            )
+        refuse_conflicts([key for key, is_given in given.items() if is_given], self.env is not None)
 
     def _find_policy(self) -> None:
         path = parser.get_path_arg("policy")
