@@ -57,6 +57,19 @@ def test_padded_steps_do_not_change_the_loss(make_baseline, policy_type, n_pads)
 
 
 @pytest.mark.parametrize("policy_type", BASELINES)
+@pytest.mark.parametrize("n_pads", [1, 3])
+def test_a_padded_window_is_seen_as_the_shorter_one(make_baseline, policy_type, n_pads):
+    """An episode's first steps look the same with padding before them and without."""
+    policy = make_baseline(policy_type)
+    batch = make_windows(policy_type=policy_type)
+    batch["observation.state_is_pad"][:, :n_pads] = True
+    shorter = {key: batch[key][:, n_pads:] for key in (*OBSERVATIONS, "observation.state_is_pad")}
+    actions = batch["action"] if policy_type == "ddpm_act" else batch["action"][:, n_pads:]
+    found = network_output(policy, batch)[:, -actions.shape[1] :]
+    torch.testing.assert_close(found, network_output(policy, {**shorter, "action": actions}))
+
+
+@pytest.mark.parametrize("policy_type", BASELINES)
 @pytest.mark.parametrize("step", [1, 3])
 def test_no_action_depends_on_later_steps(make_baseline, policy_type, step):
     """A changed action changes its own prediction and later ones alone; in a GPT an observation too."""

@@ -9,6 +9,7 @@ from conftest import train_flags
 from lerobot.scripts import lerobot_train
 
 from lerobot_swr.cli import eval as eval_command
+from lerobot_swr.cli import train as train_command
 from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 
@@ -51,3 +52,24 @@ def test_style_policies_reproduce_the_demonstrated_behaviours(
 def test_behaviour_cloning_shows_one_side_at_most(monkeypatch, tmp_path):
     """A deterministic policy without styles can not show both of two balanced behaviours."""
     assert stratified_result(monkeypatch, tmp_path, "bc", "one_side", 20_000)["l1"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "rate"), [("ddpm_gpt", "2e-3"), ("beso", "2e-3"), ("ddpm_act", "1e-3")]
+)
+def test_diffusion_policies_show_both_sides(run_command, tmp_path, policy_type, rate):
+    """Without styles, by the draw of their noise alone; five minutes of training each."""
+    root, output_dir = tmp_path / "data", tmp_path / "run"
+    write_dataset(get_recipe("medium_maze-one_side"), root, seed=0)
+    network = ("--policy.attention_dropout=0", "--policy.residual_dropout=0", "--policy.lr_schedule=cosine")
+    sizes = ("--batch_size=64", "--save_freq=6000", "--seeds=1000", f"--policy.optimizer_lr={rate}")
+    run_command(train_command.main, *train_flags(policy_type, root, output_dir, 6000, *network, *sizes))
+    policy = output_dir / "seed_1000" / "checkpoints" / "last" / "pretrained_model"
+    run_command(
+        eval_command.main,
+        *(f"--policy.path={policy}", f"--dataset.root={root}", f"--output_dir={tmp_path / 'eval'}"),
+        *("--env.type=maze2d", "--env.task=medium", "--n_episodes=100"),
+    )
+    result = json.loads((tmp_path / "eval" / "behaviors.json").read_text())
+    assert result["success_rate"] >= 0.95
+    assert result["coverage"] == 1

@@ -71,7 +71,9 @@ BASELINES = {
         steps="diffusion_steps",
         extra="lerobot[diffusion]",
     ),
-    **{name: Baseline(FAST, batch_size=64) for name in ("beso", "ddpm_gpt", "ddpm_act")},
+    "beso": Baseline(FAST, batch_size=64),
+    "ddpm_gpt": Baseline(FAST, batch_size=64),
+    "ddpm_act": Baseline({**FAST, "optimizer_lr": 1e-3}, batch_size=64),
 }
 
 
