@@ -29,11 +29,15 @@ def main() -> None:
         root = Path(folder) / "only_forward"
         write_dataset(get_recipe("medium_maze-only_forward"), root)
         single = lerobot_train(root, Path(folder) / "single", steps // 5)
-        print(f"lerobot-train:     {single:7.1f} steps/s", flush=True)
+        one_thread = lerobot_train(root, Path(folder) / "one_thread", steps // 5, OMP_NUM_THREADS="1")
+        print(
+            f"lerobot-train:     {single:7.1f} steps/s, {one_thread:.1f} with OMP_NUM_THREADS=1", flush=True
+        )
         for count in COUNTS_OF_SEEDS:
             many = seed_train(root, Path(folder) / f"{count}_seeds", steps, range(count))
             print(
-                f"lerobot-swr-train: {many:7.1f} seed-steps/s ({count} seeds), {many / single:.1f} times",
+                f"lerobot-swr-train: {many:7.1f} seed-steps/s ({count} seeds), {many / single:.1f} times, "
+                f"{many / one_thread:.1f} times that of one thread",
                 flush=True,
             )
 
@@ -46,19 +50,19 @@ def flags(root: Path, output_dir: Path, steps: int) -> list[str]:
     ]
 
 
-def run(command: str, *arguments: str) -> str:
+def run(command: str, *arguments: str, **environment: str) -> str:
     executable = str(Path(sys.executable).with_name(command))
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
+    environment = {**os.environ, "HF_HUB_OFFLINE": "1", **environment}
     done = subprocess.run([executable, *arguments], capture_output=True, text=True, env=environment)
     if done.returncode != 0:
         sys.exit(done.stderr[-3000:])
     return done.stdout + done.stderr
 
 
-def lerobot_train(root: Path, output_dir: Path, steps: int) -> float:
+def lerobot_train(root: Path, output_dir: Path, steps: int, **environment: str) -> float:
     """Steps/s of the second half of the run."""
     more = (f"--log_freq={steps // 2}", "--save_checkpoint=false")
-    log = run("lerobot-train", *flags(root, output_dir, steps), *more)
+    log = run("lerobot-train", *flags(root, output_dir, steps), *more, **environment)
     update, data = (float(value) for value in re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", log)[-1])
     return 1 / (update + data)
 
