@@ -20,8 +20,10 @@ from safetensors.torch import load_file
 from lerobot_swr.cli import train as train_command
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.training import early_updates
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.stacked_policies import StackedPolicies
+from lerobot_swr.training.traced_gradients import TracedGradients
 
 SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
 
@@ -90,6 +92,33 @@ def test_losses_and_gradients_are_those_of_a_single_policy(make_tiny_policy, pol
             torch.testing.assert_close(gradients[name][k], parameter.grad, rtol=1e-4, atol=1e-7)
 
 
+def test_a_parameter_is_handed_over_when_nothing_needs_it_any_more():
+    """Whatever takes a gradient may spoil its parameter: the other gradients are right all the same."""
+    generator = torch.Generator().manual_seed(0)
+    values = {name: torch.randn(2, 3, 3, generator=generator).requires_grad_() for name in "abc"}
+    inputs = {"x": torch.randn(2, 3, 3, generator=generator)}
+
+    def losses(parameters, drawn):
+        # The gradient of each is made of the others, and of b by way of a view.
+        product = parameters["a"] * parameters["b"].transpose(1, 2) * parameters["c"]
+        return (product * drawn["x"]).sum(dim=(1, 2))
+
+    expected = torch.autograd.grad(losses(values, inputs).sum(), list(values.values()))
+    taken = {}
+
+    def spoil(name):
+        def consume(gradient):
+            taken[name] = gradient.clone()
+            values[name].detach().fill_(float("nan"))
+
+        return consume
+
+    descent = TracedGradients(losses, values, {name: spoil(name) for name in values})
+    descent(inputs)
+    for name, gradient in zip(values, expected, strict=True):
+        torch.testing.assert_close(taken[name], gradient)
+
+
 def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
     """A large gradient of one policy is cut to the limit and leaves the other policy's alone."""
     policies = [make_tiny_policy("zbc", seed=seed, optimizer_grad_clip_norm=1.0).train() for seed in range(2)]
@@ -117,9 +146,10 @@ def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
     [("bc", ()), ("zbc", ()), ("wzbc", ()), ("wzbc", ("--policy.corrective=demos",))],
 )
 def test_a_seed_is_trained_as_lerobot_train_does(
-    lerobot_train_command, swr_train, small_maze, tmp_path, policy_type, options
+    monkeypatch, lerobot_train_command, swr_train, small_maze, tmp_path, policy_type, options
 ):
     """Same initial weights, frames, pairs and updates over more than an epoch; equal up to rounding."""
+    monkeypatch.setattr(early_updates, "SMALL", 1)  # networks of a usual size are updated early
     flags = [*SMALL, *options, "--policy.flush_denormal=false"]
     lerobot_train_command(*train_flags(policy_type, small_maze, tmp_path / "one", 70, *flags, "--seed=3"))
     swr_train(*train_flags(policy_type, small_maze, tmp_path / "all", 70, *flags, "--seeds=1,3", "--jobs=1"))
@@ -129,10 +159,12 @@ def test_a_seed_is_trained_as_lerobot_train_does(
         torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-5, msg=name)
 
 
-def test_a_seed_trained_alone_equals_that_seed_among_others(swr_train, small_maze, tmp_path):
-    """Bit for bit, training state included, in one process or in several."""
+def test_a_seed_trained_alone_equals_that_seed_among_others(monkeypatch, swr_train, small_maze, tmp_path):
+    """Bit for bit, training state included, in one process or in several, updated early or late."""
     common = ("wzbc", small_maze)
-    swr_train(*train_flags(*common, tmp_path / "alone", 40, *SMALL, "--seeds=2", "--jobs=1"))
+    with monkeypatch.context() as patch:
+        patch.setattr(early_updates, "SMALL", 1)
+        swr_train(*train_flags(*common, tmp_path / "alone", 40, *SMALL, "--seeds=2", "--jobs=1"))
     swr_train(*train_flags(*common, tmp_path / "five", 40, *SMALL, "--seeds=0,1,2,3,4", "--jobs=2"))
     last = Path("seed_2") / "checkpoints" / "000040"
     assert_same_files(tmp_path / "alone" / last, tmp_path / "five" / last)

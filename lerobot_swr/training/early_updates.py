@@ -46,7 +46,8 @@ class EarlyUpdates:
                 else:
                     single = _Updates(options, self._steps)
                     self.consume[name] = _at_once(single, single.add(block, optimizer.state[block.flat]))
-            self._late.append(small)
+            if not small.is_empty():
+                self._late.append(small)
 
     @staticmethod
     def are_possible(optimizer: torch.optim.Optimizer) -> bool:
@@ -78,6 +79,10 @@ class _Updates:
         self._gradients: list[Tensor] = []
         self._means: list[Tensor] = []
         self._squares: list[Tensor] = []
+
+    def is_empty(self) -> bool:
+        """Whether no block was added."""
+        return not self._blocks
 
     def add(self, block: ParameterBlock, state: Mapping[str, Tensor]) -> Callable[[Tensor], None]:
         """Add a block; returns what takes its gradient."""

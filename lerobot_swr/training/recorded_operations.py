@@ -52,6 +52,9 @@ def fold_constants(recorded: fx.GraphModule, parameters: Sequence[Tensor]) -> di
 
     Returns:
         Every node that is a view of a parameter's memory, with the parameter's place.
+
+    Raises:
+        NotImplementedError: If an operation makes a view of a parameter and is not known to.
     """
     graph = recorded.graph
     inputs = [node for node in graph.nodes if node.op == "placeholder"][: len(parameters)]
@@ -65,10 +68,11 @@ def fold_constants(recorded: fx.GraphModule, parameters: Sequence[Tensor]) -> di
             values[node] = SHAPE_ONLY[node.target](meta.shape, dtype=meta.dtype, device=device)
             continue
         sources = node.all_input_nodes
-        if not all(source in values for source in sources):
+        if not all(source in values for source in sources) or _is_random(node):
             continue
         owners = {owner[source] for source in sources if source in owner}
         if owners and node.target not in VIEWS:
+            _check_returns_no_view(node)
             continue
         values[node] = _call(node, values)
         if owners:
@@ -131,6 +135,16 @@ def _call(node: fx.Node, values: dict[fx.Node, Tensor]) -> Any:
     arguments = fx.map_arg(node.args, values.__getitem__)
     options = fx.map_arg(node.kwargs, values.__getitem__)
     return node.target(*arguments, **options)  # type: ignore[operator]
+
+
+def _is_random(node: fx.Node) -> bool:
+    return torch.Tag.nondeterministic_seeded in getattr(node.target, "tags", ())
+
+
+def _check_returns_no_view(node: fx.Node) -> None:
+    """A view that is not known to be one would let its parameter be updated too early."""
+    if any(returned.alias_info is not None for returned in node.target._schema.returns):  # type: ignore
+        raise NotImplementedError(f"{node.target} returns a view of a parameter: add it to VIEWS")
 
 
 def _layout(node: fx.Node) -> tuple[Any, Any] | None:
