@@ -242,7 +242,10 @@ def test_episodes_that_are_left_out_get_no_style(swr_train, small_maze, tmp_path
     ("flags", "message"),
     [
         (("--seeds=1,1",), r"seeds=\[1, 1\]"),
-        (("--policy.type=act", "--dataset.streaming=true"), "dataset.streaming: not available"),
+        (
+            ("--policy.type=act", "--dataset.streaming=true"),
+            "streaming: not available in .*; switch off, or use",
+        ),
         (("--dataset.eval_split=0.2", "--eval_steps=5"), "eval_steps: not available"),
         (("--jobs=0",), "jobs=0"),
         (("--seed=7",), "seed=7: this command takes --seeds=7"),
@@ -269,6 +272,9 @@ def test_an_existing_folder_and_changed_options_are_refused(swr_train, small_maz
     with pytest.raises(SystemExit):
         swr_train(*flags, "--resume=true", "--policy.style_dim=4")
     assert "other values of policy" in capfd.readouterr().err
+    with pytest.raises(SystemExit):
+        swr_train(*flags, "--resume=true", "--cudnn_deterministic=true")
+    assert "other values of cudnn_deterministic" in capfd.readouterr().err
 
 
 def test_a_fine_tuned_run_resumes_and_each_seed_draws_its_own_pairs(swr_train, small_maze, tmp_path):

@@ -1,6 +1,7 @@
 """``lerobot-swr-train`` for policies that LeRobot's own loop trains, on frames in memory."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import train_flags
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy_config
@@ -18,7 +20,9 @@ from safetensors.torch import load_file
 from torch.utils.data import DataLoader
 
 from lerobot_swr.cli import train as train_command
+from lerobot_swr.training import SeedsTrainConfig
 from lerobot_swr.training.memory_dataset import MemoryDataset
+from lerobot_swr.training.seed_runs import drop_incomplete, last_step
 
 SMALL = {
     "beso": ("--policy.dim_model=16", "--policy.n_heads=2"),
@@ -142,20 +146,42 @@ def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp
         assert_same_run(tmp_path / "whole" / last, tmp_path / "killed" / last)
 
 
-def test_finished_seeds_are_left_alone_and_half_written_ones_start_anew(swr_train, small_maze, tmp_path):
-    """A checkpoint without LeRobot's link to it was not complete."""
+def test_resuming_keeps_what_is_complete(swr_train, small_maze, tmp_path):
+    """Half-written checkpoints are trained again, from the last complete one; a missing link is mended."""
     flags = train_flags("beso", small_maze, tmp_path / "run", 4, *SMALL["beso"], "--jobs=1")
-    swr_train(*flags, "--seeds=0,1")
-    files = [
-        tmp_path / f"run/seed_{seed}/checkpoints/000004/pretrained_model/model.safetensors" for seed in (0, 1)
-    ]
-    before = [file.stat().st_mtime_ns for file in files]
-    expected = load_file(files[1])
-    (tmp_path / "run/seed_1/checkpoints/last").unlink()
-    files[1].write_bytes(b"half")
-    swr_train(*flags, "--seeds=0,1", "--resume=true")
-    assert files[0].stat().st_mtime_ns == before[0]
-    assert all(torch.equal(value, expected[key]) for key, value in load_file(files[1]).items())
+    swr_train(*flags, "--seeds=0,1", "--save_freq=2")
+    runs = [tmp_path / f"run/seed_{seed}/checkpoints" for seed in (0, 1)]
+    model = Path("pretrained_model/model.safetensors")
+    kept = [runs[0] / "000002" / model, runs[0] / "000004" / model, runs[1] / "000002" / model]
+    before = [file.stat().st_mtime_ns for file in kept]
+    expected = load_file(runs[1] / "000004" / model)
+    for run in runs:  # LeRobot takes the link away before it sets it anew
+        (run / "last").unlink()
+    (runs[1] / "000004" / model).write_bytes(b"half")
+    shutil.rmtree(runs[1] / "000004/training_state")
+    swr_train(*flags, "--seeds=0,1", "--save_freq=1", "--resume=true")
+    assert [file.stat().st_mtime_ns for file in kept] == before
+    found = load_file(runs[1] / "000004" / model)
+    assert all(torch.equal(value, expected[key]) for key, value in found.items())
+    assert [(run / "last").resolve().name for run in runs] == ["000004", "000004"]
+    assert (runs[1] / "000003").is_dir()  # the command's --save_freq, not the run's
+
+
+def test_without_a_complete_checkpoint_a_run_starts_anew(tmp_path):
+    """A kill within the first checkpoint; within a later one only that is dropped."""
+    run = SeedsTrainConfig(DatasetConfig("local/small_maze"), output_dir=tmp_path, steps=4).of_seed(0)
+    for step, groups in ((2, "[{}]"), (3, "[{}]"), (4, '[{"lr"')):
+        state = tmp_path / f"seed_0/checkpoints/{step:06d}/training_state"
+        state.mkdir(parents=True)
+        (state / "optimizer_param_groups.json").write_text(groups)
+    drop_incomplete(run)
+    assert last_step(run) == 3
+    assert sorted(path.name for path in (tmp_path / "seed_0/checkpoints").iterdir()) == ["000002", "000003"]
+    for file in tmp_path.rglob("*.json"):
+        file.write_text("")
+    drop_incomplete(run)
+    assert last_step(run) == 0
+    assert not (tmp_path / "seed_0").exists()
 
 
 def test_an_error_in_training_is_explained(swr_train, small_maze, tmp_path, capfd):

@@ -6,7 +6,7 @@
   with `recorded_operations`, and `early_updates`.
 * `memory`: settings of a training process.
 * `seed_runs`: runs on disk, their checkpoints, resuming.
-* `seed_training`: the loop, spread over processes.
+* `seed_training`: the loop, spread over `processes`.
 * `separate_training`, `memory_dataset`: other policies, in LeRobot's own loop, with their frames in memory.
 """
 

@@ -15,6 +15,7 @@ OPTIONS_FILE = "seeds_train_config.json"
 DECISIVE = (
     *("dataset", "policy", "batch_size", "steps"),
     *("optimizer", "scheduler", "use_policy_training_preset"),
+    *("peft", "sample_weighting", "rename_map", "cudnn_deterministic"),
 )
 
 
@@ -83,9 +84,10 @@ class SeedsTrainConfig(TrainPipelineConfig):
             }
         given = [key for key, is_given in refused.items() if is_given]
         if given:
+            hint = " (--env_eval_freq=0, and evaluate afterwards)" if "env" in given else ""
             raise ValueError(
-                f"{', '.join(given)}: not available when several seeds are trained at once; switch off "
-                "(for env: --env_eval_freq=0, and evaluate afterwards), or use lerobot-train"
+                f"{', '.join(given)}: not available in lerobot-swr-train; switch off{hint}, "
+                "or use lerobot-train"
             )
 
     def of_seed(self, seed: int) -> TrainPipelineConfig:

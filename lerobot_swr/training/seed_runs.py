@@ -5,7 +5,6 @@ import os
 import shutil
 from pathlib import Path
 
-from huggingface_hub.constants import SAFETENSORS_SINGLE_FILE
 from lerobot.common.train_utils import (
     get_step_checkpoint_dir,
     load_training_state,
@@ -20,11 +19,10 @@ from lerobot.processor import PolicyProcessorPipeline
 from lerobot.utils.constants import (
     CHECKPOINTS_DIR,
     LAST_CHECKPOINT_LINK,
-    OPTIMIZER_STATE,
+    OPTIMIZER_PARAM_GROUPS,
     PRETRAINED_MODEL_DIR,
-    RNG_STATE,
+    SCHEDULER_STATE,
     TRAINING_STATE_DIR,
-    TRAINING_STEP,
 )
 from lerobot.utils.random_utils import set_seed
 
@@ -46,7 +44,7 @@ def check_options(config: SeedsTrainConfig) -> None:
     file, options = config.output_dir / OPTIONS_FILE, json.loads(json.dumps(config.decisive_options()))
     if file.is_file() and is_begun(config.output_dir):
         known = json.loads(file.read_text())
-        changed = sorted(key for key in options if options[key] != known.get(key))
+        changed = sorted(key for key in options.keys() & known.keys() if options[key] != known[key])
         if changed:
             raise ValueError(
                 f"output_dir={str(config.output_dir)!r} was begun with other values of {', '.join(changed)} "
@@ -64,7 +62,7 @@ def last_step(run: TrainPipelineConfig) -> int:
     assert run.output_dir is not None
     folder = run.output_dir / CHECKPOINTS_DIR
     steps = [int(path.name) for path in folder.iterdir() if path.name.isdigit()] if folder.is_dir() else []
-    return max((step for step in steps if _is_complete(checkpoint_folder(run, step))), default=0)
+    return max((step for step in steps if _is_complete(run, step)), default=0)
 
 
 def checkpoint_folder(run: TrainPipelineConfig, step: int) -> Path:
@@ -73,13 +71,27 @@ def checkpoint_folder(run: TrainPipelineConfig, step: int) -> Path:
     return get_step_checkpoint_dir(run.output_dir, run.steps, step)
 
 
-def _is_complete(checkpoint: Path) -> bool:
-    """Whether everything is there that resuming needs (LeRobot's own command writes in place)."""
-    state = checkpoint / TRAINING_STATE_DIR
-    needed = [state / OPTIMIZER_STATE, state / RNG_STATE, state / TRAINING_STEP]
-    return all(
-        file.is_file() for file in [checkpoint / PRETRAINED_MODEL_DIR / SAFETENSORS_SINGLE_FILE, *needed]
-    )
+def _is_complete(run: TrainPipelineConfig, step: int) -> bool:
+    """Whether the file that LeRobot writes last is whole; its own command writes in place."""
+    state = checkpoint_folder(run, step) / TRAINING_STATE_DIR
+    name = OPTIMIZER_PARAM_GROUPS if run.scheduler is None else SCHEDULER_STATE
+    files = list(state.rglob(name))  # several optimizers have a folder each
+    try:
+        return bool([json.loads(file.read_text()) for file in files])
+    except json.JSONDecodeError:
+        return False
+
+
+def drop_incomplete(run: TrainPipelineConfig) -> None:
+    """Delete the checkpoints after the last complete one, and without one all that the run has written."""
+    assert run.output_dir is not None
+    step = last_step(run)
+    if not step:
+        shutil.rmtree(run.output_dir, ignore_errors=True)
+        return
+    for folder in (run.output_dir / CHECKPOINTS_DIR).iterdir():
+        if folder.name.isdigit() and int(folder.name) > step:
+            shutil.rmtree(folder)
 
 
 def point_to_last(run: TrainPipelineConfig) -> Path:

@@ -4,10 +4,9 @@ import logging
 import math
 import multiprocessing
 import os
-import sys
-import time
 from collections.abc import Callable, Iterator
 from itertools import groupby
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from tqdm import tqdm
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.memory import keep_freed_memory, large_pages
+from lerobot_swr.training.processes import explained_exit, run_processes
 from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step, point_to_last
 from lerobot_swr.training.separate_training import train_separately
 
@@ -73,31 +73,13 @@ def _spread(seeds: list[int], steps: dict[int, int], jobs: int) -> Iterator[list
 def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps: dict[int, int]) -> None:
     context = multiprocessing.get_context("spawn")
     done = context.Array("q", len(groups), lock=False)
-    waiting = [
+    processes: list[tuple[list[int], BaseProcess]] = [
         (seeds, context.Process(target=_process, args=(config, seeds, done, i, os.getpid()), daemon=True))
         for i, seeds in enumerate(groups)
     ]
-    running: list[tuple[list[int], Any]] = []
     total = sum(config.steps - steps[seed] for seeds in groups for seed in seeds)
     with tqdm(total=total, desc="Training", unit="seed-step") as bar, large_pages():
-        try:
-            while waiting or running:
-                while waiting and len(running) < (config.jobs or 1):
-                    running.append(waiting.pop(0))
-                    running[-1][1].start()
-                time.sleep(0.2)
-                bar.update(sum(done) - bar.n)
-                for seeds, process in running:
-                    if process.exitcode:
-                        raise ChildProcessError(
-                            f"the process that trains seeds {seeds} ended with status {process.exitcode}; "
-                            "what it said is above. Checkpoints are kept: go on with --resume=true "
-                            "(--jobs=1 if memory was short)"
-                        )
-                running = [(seeds, process) for seeds, process in running if process.exitcode is None]
-        finally:
-            for _, process in running:
-                process.terminate()
+        run_processes(processes, config.jobs or 1, lambda: bar.update(sum(done) - bar.n))
 
 
 def _process(config: SeedsTrainConfig, seeds: list[int], done: Any, group: int, parent: int) -> None:
@@ -109,11 +91,8 @@ def _process(config: SeedsTrainConfig, seeds: list[int], done: Any, group: int, 
         done[group] += len(seeds)
 
     init_logging()
-    try:
+    with explained_exit():
         _train_group(config, seeds, count)
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
 
 
 def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[], None] | None = None) -> None:

@@ -2,23 +2,25 @@
 
 import multiprocessing
 import os
-import shutil
 import sys
 import threading
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from unittest.mock import patch
 
 import torch
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.scripts import lerobot_train
-from lerobot.utils.constants import CHECKPOINTS_DIR, LAST_CHECKPOINT_LINK, PRETRAINED_MODEL_DIR
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_swr.configuration import resuming
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.memory import keep_freed_memory
 from lerobot_swr.training.memory_dataset import frames_in_memory
+from lerobot_swr.training.processes import explained_exit, run_processes
+from lerobot_swr.training.seed_runs import drop_incomplete, last_step, point_to_last
+
+OPTIONS_ON_RESUME = ("save_freq", "log_freq", "num_workers", "env_eval_freq", "eval_steps")
 
 
 def train_separately(config: SeedsTrainConfig) -> list[Path]:
@@ -31,35 +33,18 @@ def train_separately(config: SeedsTrainConfig) -> list[Path]:
         The folder of each seed's trained policy.
 
     Raises:
-        BrokenProcessPool: If a process was killed.
+        ChildProcessError: If a process failed; it has said why.
     """
     runs = {seed: config.of_seed(seed) for seed in config.seeds}
-    waiting = [seed for seed, run in runs.items() if not _is_finished(run)]
-    if waiting:
-        with ProcessPoolExecutor(
-            min(config.jobs or 1, len(waiting)),
-            multiprocessing.get_context("spawn"),
-            max_tasks_per_child=1,
-        ) as pool:
-            futures = [pool.submit(_train_seed, config, seed) for seed in waiting]
-            try:
-                for future in as_completed(futures):
-                    future.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-    return [_last(run) / PRETRAINED_MODEL_DIR for run in runs.values()]
-
-
-def _last(run: TrainPipelineConfig) -> Path:
-    """Link to a run's last checkpoint; LeRobot sets it when the checkpoint is complete."""
-    assert run.output_dir is not None
-    return run.output_dir / CHECKPOINTS_DIR / LAST_CHECKPOINT_LINK
-
-
-def _is_finished(run: TrainPipelineConfig) -> bool:
-    last = _last(run)
-    return last.is_dir() and int(last.resolve().name) == run.steps
+    context = multiprocessing.get_context("spawn")
+    # No daemons: LeRobot's loop may have processes of its own, for environments and for loading.
+    processes: list[tuple[list[int], BaseProcess]] = [
+        ([seed], context.Process(target=_train_seed, args=(config, seed)))
+        for seed, run in runs.items()
+        if last_step(run) < run.steps
+    ]
+    run_processes(processes, config.jobs or 1)
+    return [point_to_last(run) for run in runs.values()]
 
 
 def _train_seed(config: SeedsTrainConfig, seed: int) -> None:
@@ -69,25 +54,27 @@ def _train_seed(config: SeedsTrainConfig, seed: int) -> None:
     torch.set_num_threads(1)  # several processes share the cores
     keep_freed_memory()
     run = config.of_seed(seed)
-    assert run.output_dir is not None
-    with frames_in_memory():
-        if not _last(run).is_dir():
-            shutil.rmtree(
-                run.output_dir, ignore_errors=True
-            )  # killed before the first checkpoint was complete
+    drop_incomplete(run)
+    with explained_exit(), frames_in_memory():
+        if last_step(run):
+            with patch.object(sys, "argv", _resume_command(run)):
+                lerobot_train.train()
+        else:
             with resuming(False):  # whatever the command said of the other seeds
                 lerobot_train.train(run)
-            return
-        command = [
-            "lerobot-train",
-            f"--config_path={_last(run) / PRETRAINED_MODEL_DIR / TRAIN_CONFIG_NAME}",
-            "--resume=true",
-            f"--output_dir={run.output_dir}",
-        ]
-        if run.dataset.root is not None:
-            command.append(f"--dataset.root={run.dataset.root}")
-        with patch.object(sys, "argv", command):
-            lerobot_train.train()
+
+
+def _resume_command(run: TrainPipelineConfig) -> list[str]:
+    """Words of the ``lerobot-train`` command that goes on with a run; it reads other options from the run."""
+    options = {
+        "config_path": point_to_last(run) / TRAIN_CONFIG_NAME,
+        "resume": "true",
+        "output_dir": run.output_dir,
+        **{key: getattr(run, key) for key in OPTIONS_ON_RESUME},
+    }
+    if run.dataset.root is not None:
+        options["dataset.root"] = run.dataset.root
+    return ["lerobot-train", *(f"--{key}={value}" for key, value in options.items())]
 
 
 def _end_with_parent() -> None:

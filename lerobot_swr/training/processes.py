@@ -1,0 +1,55 @@
+"""Processes that train seeds beside each other."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from multiprocessing.process import BaseProcess
+
+
+def run_processes(
+    processes: list[tuple[list[int], BaseProcess]], jobs: int, tick: Callable[[], None] | None = None
+) -> None:
+    """Run processes, ``jobs`` at once; when one fails, the others are ended.
+
+    Args:
+        processes: Seeds and the process that trains them, not started yet.
+        jobs: How many run at once.
+        tick: Called several times a second.
+
+    Raises:
+        ChildProcessError: If a process failed; it has said why.
+    """
+    waiting = list(processes)
+    running: list[tuple[list[int], BaseProcess]] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                running.append(waiting.pop(0))
+                running[-1][1].start()
+            time.sleep(0.2)
+            if tick is not None:
+                tick()
+            for seeds, process in running:
+                if process.exitcode:
+                    raise ChildProcessError(
+                        f"the process that trains seeds {seeds} ended with status {process.exitcode}; "
+                        "what it said is above. Checkpoints are kept: go on with --resume=true "
+                        "(--jobs=1 if memory was short)"
+                    )
+            running = [(seeds, process) for seeds, process in running if process.exitcode is None]
+    finally:
+        for _, process in running:
+            process.terminate()
+        for _, process in running:
+            process.join()
+
+
+@contextmanager
+def explained_exit() -> Iterator[None]:
+    """In such a process: print the message of an input error and exit with status 2."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
