@@ -1,10 +1,10 @@
-"""How configurations of this package meet LeRobot's parser: refusing bad values, telling a resumed run."""
+"""How configurations of this package meet LeRobot's parser: refusing bad values, telling what a run is."""
 
 import functools
 import math
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ from typing import Any
 import yaml
 from huggingface_hub import constants
 from lerobot.configs import parser
-from lerobot.configs.train import TRAIN_CONFIG_NAME
+from lerobot.configs.default import DatasetConfig
+from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 
 
@@ -49,16 +50,26 @@ def check_dataset_folder() -> None:
         )
 
 
-def training_episodes(meta: LeRobotDatasetMetadata) -> list[int] | None:
-    """The episodes of a dataset that the running command trains on; None for all.
+_training_on: ContextVar[DatasetConfig | None] = ContextVar("training_on", default=None)
+_resuming: ContextVar[bool | None] = ContextVar("resuming", default=None)
 
-    LeRobot creates a policy with the metadata of the whole dataset. What ``--dataset.episodes`` and
-    ``--dataset.eval_split`` leave is therefore read from the command line and its configuration file.
+
+def training_episodes(meta: LeRobotDatasetMetadata) -> list[int] | None:
+    """The episodes of a dataset that the policy that is being made trains on; None for all.
+
+    LeRobot creates a policy with the metadata of the whole dataset. Unless `training_on` says it, what
+    ``--dataset.episodes`` and ``--dataset.eval_split`` leave is therefore read from the command line and its
+    configuration file.
 
     Args:
         meta: Metadata of the training dataset.
+
+    Raises:
+        ValueError: If the command's configuration file is not found.
     """
-    episodes, share = _dataset_option("episodes"), _dataset_option("eval_split") or 0.0
+    told = _training_on.get()
+    options = _dataset_options("episodes", "eval_split") if told is None else vars(told)
+    episodes, share = options["episodes"], options["eval_split"] or 0.0
     if not share:
         return episodes
     by_task: dict[str, list[int]] = {}
@@ -68,20 +79,38 @@ def training_episodes(meta: LeRobotDatasetMetadata) -> list[int] | None:
     return [i for group in by_task.values() for i in group[: len(group) - math.ceil(len(group) * share)]]
 
 
-def _dataset_option(key: str) -> Any:
-    """Value of ``--dataset.<key>``, from the command line or else the file at ``--config_path``."""
-    given = parser.parse_arg(f"dataset.{key}")
-    if given is not None:
-        return yaml.safe_load(given)
-    file = Path(parser.parse_arg("config_path") or "")
-    if file.is_dir():
-        file = file / TRAIN_CONFIG_NAME
-    if not file.is_file():
-        return None
-    return (yaml.safe_load(file.read_text()).get("dataset") or {}).get(key)  # JSON is YAML, too
+def _dataset_options(*keys: str) -> dict[str, Any]:
+    """Values of ``--dataset.<key>``, from the command line or else the file at ``--config_path``."""
+    given = {key: _last_given(f"dataset.{key}") for key in keys}
+    name = parser.parse_arg("config_path")
+    filed = {} if name is None or None not in given.values() else _dataset_of_file(name)
+    return {k: filed.get(k) if value is None else yaml.safe_load(value) for k, value in given.items()}
 
 
-_resuming: ContextVar[bool | None] = ContextVar("resuming", default=None)
+def _last_given(option: str) -> str | None:
+    """Value of a flag; of several the last, as for a configuration's fields (`parse_arg` takes the first)."""
+    for place in range(len(sys.argv) - 1, 0, -1):
+        value = parser.parse_arg(option, sys.argv[place : place + 2])
+        if value is not None:
+            return value
+    return None
+
+
+def _dataset_of_file(name: str) -> dict[str, Any]:
+    """The section ``dataset`` of a ``--config_path``: a file, a folder, or a repository of the Hub."""
+    path = Path(name)
+    file = path / TRAIN_CONFIG_NAME if path.is_dir() else path
+    if file.is_file():
+        return yaml.safe_load(file.read_text()).get("dataset") or {}  # JSON is YAML, too
+    if path.is_dir():
+        return {}  # LeRobot goes on with its defaults
+    try:
+        return vars(TrainPipelineConfig.from_pretrained(name).dataset)
+    except (OSError, ValueError) as error:
+        raise ValueError(
+            f"config_path={name!r}: found neither here nor on the Hub, so the episodes to train on are not "
+            "known; give the path of the configuration file"
+        ) from error
 
 
 def is_resuming() -> bool:
@@ -90,11 +119,20 @@ def is_resuming() -> bool:
     return parser.parse_arg("resume") in ("true", "True", "yes", "1") if told is None else told
 
 
+def resuming(value: bool) -> AbstractContextManager[None]:
+    """Say within a block what `is_resuming` would otherwise read from the command line."""
+    return _said(_resuming, value)
+
+
+def training_on(dataset: DatasetConfig) -> AbstractContextManager[None]:
+    """Say within a block what `training_episodes` would otherwise read from the command line."""
+    return _said(_training_on, dataset)
+
+
 @contextmanager
-def resuming(value: bool) -> Iterator[None]:
-    """Say within the block what `is_resuming` would otherwise read from the command line."""
-    token = _resuming.set(value)
+def _said(variable: ContextVar[Any], value: Any) -> Iterator[None]:
+    token = variable.set(value)
     try:
         yield
     finally:
-        _resuming.reset(token)
+        variable.reset(token)

@@ -19,7 +19,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 
-from lerobot_swr.configuration import training_episodes
+from lerobot_swr.configuration import training_episodes, training_on
 from lerobot_swr.corrective.inverse_model import fit_inverse_model
 from lerobot_swr.corrective.relative_actions import RelativeActions, Units
 from lerobot_swr.demos.dataset_writer import write_dataset
@@ -407,6 +407,43 @@ def test_the_episodes_to_train_on_are_lerobots(small_maze, small_maze_meta, monk
     expected, _ = make_train_eval_datasets(config)
     found = training_episodes(small_maze_meta)
     assert (found and sorted(found)) == (expected.episodes and sorted(expected.episodes))
+
+
+def test_of_several_flags_the_last_counts(small_maze_meta, monkeypatch):
+    """As in LeRobot's parser, in either way of writing them; null takes all, whatever the file says."""
+    several = ["--dataset.episodes=[0]", "--dataset.episodes", "[1, 2]", "--steps=3"]
+    for more, expected in (
+        ([], [1, 2]),
+        (["--dataset.episodes=[4]"], [4]),
+        (["--dataset.episodes=null"], None),
+    ):
+        monkeypatch.setattr("sys.argv", ["lerobot-train", *several, *more])
+        assert training_episodes(small_maze_meta) == expected
+
+
+def test_a_configuration_on_the_hub_names_the_episodes(small_maze, small_maze_meta, tmp_path, monkeypatch):
+    """--config_path=user/repository, as LeRobot finds it; what is found nowhere is refused."""
+    dataset = DatasetConfig("local/small_maze", root=str(small_maze), episodes=[0, 4], eval_split=0.5)
+    policy = make_policy_config("zbc", device="cpu", push_to_hub=False)
+    TrainPipelineConfig(dataset, policy=policy).save_pretrained(tmp_path)
+    monkeypatch.setattr("sys.argv", ["lerobot-train", "--config_path=some/run", "--dataset.eval_split=0"])
+    with pytest.raises(ValueError, match="config_path='some/run': found neither here nor on the Hub"):
+        training_episodes(small_maze_meta)
+    monkeypatch.setattr(
+        "lerobot.configs.train.hf_hub_download", lambda filename, **_: str(tmp_path / filename)
+    )
+    assert training_episodes(small_maze_meta) == [0, 4]
+
+
+def test_what_a_program_says_counts_against_its_command_line(small_maze, small_maze_meta, monkeypatch):
+    """Within the block alone; of all episodes, too."""
+    monkeypatch.setattr("sys.argv", ["program", "--dataset.episodes=[0]"])
+    root = str(small_maze)
+    with training_on(DatasetConfig("local/small_maze", root=root, episodes=[1, 2, 5])):
+        assert training_episodes(small_maze_meta) == [1, 2, 5]
+    with training_on(DatasetConfig("local/small_maze", root=root)):
+        assert training_episodes(small_maze_meta) is None
+    assert training_episodes(small_maze_meta) == [0]
 
 
 # --- Refusals ---

@@ -13,15 +13,19 @@ import pytest
 import torch
 from conftest import SMALL_MAZE, make_batch, train_flags
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import EpisodeAwareSampler
-from lerobot.policies.factory import get_policy_class
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 
 from lerobot_swr.cli import train as train_command
+from lerobot_swr.corrective.inverse_model import fit_inverse_model
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.training import early_updates
+from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
+from lerobot_swr.training.seed_runs import SeedRuns
 from lerobot_swr.training.stacked_policies import StackedPolicies
 from lerobot_swr.training.traced_gradients import TracedGradients
 
@@ -236,6 +240,18 @@ def test_episodes_that_are_left_out_get_no_style(swr_train, small_maze, tmp_path
     config = PreTrainedConfig.from_pretrained(folder)
     policy = get_policy_class(config.type).from_pretrained(folder, config=config)
     assert policy.styles.trained.tolist() == [0, 1, 0, 0, 1, 1]
+
+
+def test_the_dynamics_are_those_of_the_runs_episodes(small_maze, small_maze_meta, tmp_path, monkeypatch):
+    """Whatever the flags of the program mean that trains seeds from Python."""
+    monkeypatch.setattr("sys.argv", ["program", "--dataset.episodes=[0,2]"])
+    dataset = DatasetConfig("local/small_maze", root=str(small_maze), episodes=[1, 4, 5])
+    policy = make_policy_config("zbc", device="cpu", push_to_hub=False, hidden_dim=16, corrective="noise")
+    config = SeedsTrainConfig(dataset, policy=policy, output_dir=tmp_path / "run", seeds=[0], jobs=1)
+    config.validate()
+    (made,) = SeedRuns(config, [0], small_maze_meta).policies
+    expected = fit_inverse_model(made.trajectories.subset([1, 4, 5])).r2
+    assert made.config.inverse_r2 == pytest.approx(expected, abs=1e-4)
 
 
 @pytest.mark.parametrize(

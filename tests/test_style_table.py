@@ -221,6 +221,29 @@ def test_an_older_checkpoint_loads_without_its_table_and_gets_one_by_command(
     assert len(reload(checkpoint).styles.filter("length > 3")) == 6
 
 
+@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
+def test_a_table_made_anew_leaves_the_facts_of_training_alone(
+    make_tiny_policy, small_maze, small_maze_meta, tmp_path, run_command, policy_type
+):
+    """The new metrics are noted; what config.json says of the dynamics in training stays."""
+    policy = trained(make_tiny_policy(policy_type, corrective="noise"))
+    folder = save_checkpoint(policy, small_maze_meta, tmp_path / "checkpoint")
+    known = {**json.loads((folder / "config.json").read_text()), "inverse_horizon": 7, "inverse_r2": [0.9, 1]}
+    (folder / "config.json").write_text(json.dumps(known))
+    metric = f"{__name__}:last_y"
+    run_command(
+        styles_command.main,
+        folder,
+        f"--dataset.root={small_maze}",
+        "--dataset.episodes=[0]",  # of which no dynamics could be learned
+        f"--style_metrics={metric}",
+    )
+    assert json.loads((folder / "config.json").read_text()) == {**known, "style_metrics": metric}
+    new = load_style_table(folder)
+    assert new.columns == {**policy.styles.table.columns, "last_y": new.columns["last_1"]}
+    assert new.neighbours == policy.styles.table.neighbours
+
+
 def test_filters_are_previewed_named_listed_and_forgotten_by_command(checkpoint, run_command, capsys):
     """The preview counts; the name is kept with the checkpoint until it is forgotten."""
     run_command(styles_command.main, checkpoint, "--filter=behavior == '20'", "--name=right")

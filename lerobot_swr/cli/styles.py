@@ -146,9 +146,10 @@ def _make_table_anew(cfg: StylesCommand, config: ZBCConfig) -> None:
         )
     checkpoint = load_checkpoint(config)
     load_reference(cfg.dataset, checkpoint)  # refuses another dataset
-    policy = type(checkpoint.policy)(config, dataset_meta=cfg.dataset.metadata())
-    stored = checkpoint.policy.styles.table
-    table: StyleTable = policy.styles.table
+    # A policy made for training would take this for its training and describe the dynamics anew.
+    policy, meta = checkpoint.policy, cfg.dataset.metadata()
+    stored = policy.styles.table
+    table: StyleTable = policy.make_table(policy.read_demonstrations(meta), meta)
     for name, text in ({} if stored is None else stored.filters).items():
         table = table.with_filter(name, text)
     table.save(cfg.checkpoint)

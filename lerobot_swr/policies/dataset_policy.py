@@ -45,8 +45,7 @@ class DatasetPolicy(StatePolicy):
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
         """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
         config = self.config
-        outcomes = [key for key in OUTCOMES if key in meta.features]
-        self._trajectories = load_trajectories(meta, [*config.observation_keys, ACTION, *outcomes])
+        self._trajectories = self.read_demonstrations(meta)
         self._dataset_meta = meta
         # LeRobot's own fine-tuning would hand the raw statistics to the processors.
         meta.stats = with_unit_std_where_constant(config, meta.stats)
@@ -60,6 +59,11 @@ class DatasetPolicy(StatePolicy):
                 "original dataset, or fine-tune on this one with --policy.path instead of --resume"
             )
         config.num_episodes, config.dataset_fingerprint = len(self._trajectories), fingerprint
+
+    def read_demonstrations(self, meta: LeRobotDatasetMetadata) -> Trajectories:
+        """What a policy like this one takes from a dataset: observations, actions and, if any, outcomes."""
+        outcomes = [key for key in OUTCOMES if key in meta.features]
+        return load_trajectories(meta, [*self.config.observation_keys, ACTION, *outcomes])
 
     @property
     def trajectories(self) -> Trajectories:

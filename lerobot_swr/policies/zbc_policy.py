@@ -20,6 +20,7 @@ from lerobot_swr.similarity import cached_distances
 from lerobot_swr.style_selection import StyleSelection
 from lerobot_swr.style_table import StyleTable, load_style_table, make_style_table
 from lerobot_swr.styles import StyleCookbook
+from lerobot_swr.trajectories import Trajectories
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class ZBCPolicy(BCPolicy):
             stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
             self.corrections.adopt_dataset(config, self._dynamics, stats, self._episode_weights)
         if dataset_meta is not None:
-            self.styles.table = self._make_table(dataset_meta)
+            self.styles.table = self.make_table(self.trajectories, dataset_meta)
 
     @property
     def _style_dim(self) -> int:
@@ -138,10 +139,17 @@ class ZBCPolicy(BCPolicy):
         """The features over which ν compares demonstrations."""
         return self.config.observation_keys
 
-    def _make_table(self, meta: LeRobotDatasetMetadata) -> StyleTable:
+    def make_table(self, trajectories: Trajectories, meta: LeRobotDatasetMetadata) -> StyleTable:
+        """The table of demonstrations, which need not have been given to the policy when it was created.
+
+        Args:
+            trajectories: What `read_demonstrations` finds in the dataset.
+            meta: The dataset's metadata.
+        """
         rule = dataset_behavior_rule(self.config.behavior_rule, meta.robot_type)
         metrics = load_style_metrics(self.config.style_metrics)
-        return make_style_table(self.trajectories, self.distances(), rule, metrics)
+        distances = cached_distances(trajectories, self.compared_keys(), Path(meta.root))
+        return make_style_table(trajectories, distances, rule, metrics)
 
     def reset(self) -> None:
         """Start a rollout: the next action draws new styles, one per environment."""

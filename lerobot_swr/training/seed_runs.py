@@ -26,7 +26,7 @@ from lerobot.utils.constants import (
 )
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_swr.configuration import resuming
+from lerobot_swr.configuration import resuming, training_on
 from lerobot_swr.policies.modeling_swr import BCPolicy
 from lerobot_swr.training.configuration_training import OPTIONS_FILE, SeedsTrainConfig, is_begun
 from lerobot_swr.training.stacked_policies import StackedPolicies
@@ -144,7 +144,7 @@ class SeedRuns:
             run.policy.pretrained_path = path
         assert run.policy is not None
         set_seed(run.seed)  # as lerobot-train does, so that the policy starts from the same weights
-        with resuming(bool(self.step)):
+        with resuming(bool(self.step)), training_on(run.dataset):
             policy = make_policy(run.policy, ds_meta=meta)
         assert isinstance(policy, BCPolicy)
         return policy
