@@ -132,6 +132,14 @@ def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
     assert plain.definition["env"]["episode_length"] == 200
 
 
+def test_every_cell_about_an_environment_holds_all_of_its_options(settings, demos):
+    """So that no result of an older default is taken for one of the new default."""
+    figures = suite_cells("figures", settings, [demos])
+    named = {cell.kind: cell for cell in (demos.cell, *figures)}
+    for kind in ("dataset", "similarity", "styles", "evaluate"):
+        assert named[kind].definition["env"]["episode_length"] == 200
+
+
 def test_names_tell_what_differs(settings, demos):
     """Numbers short, words as they are; options of the settings, too."""
     differing = {"beta": 3.0, "corrective": "demos", "residual": False, "style_dim": 4}

@@ -10,11 +10,10 @@ from typing import Any
 
 import draccus
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig
 
 from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.demonstrations import Demonstrations, whole_environment
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
 
@@ -149,7 +148,7 @@ def _rolled_out(
     """What defines rollouts apart from who acts."""
     stratified = _stratified_rollouts(settings.n_rollouts, len(demos.lengths))
     return {
-        "env": draccus.encode(environment({**demos.env, **(env or {})}), EnvConfig),
+        "env": whole_environment({**demos.env, **(env or {})}),
         "protocols": {p: stratified if p == "stratified" else settings.n_rollouts for p in protocols},
         "seed": EVALUATION_SEED,
     }

@@ -5,7 +5,7 @@ from typing import Any
 
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.demonstrations import Demonstrations, environment, whole_environment
 from lerobot_swr.reproduction.experiments import evaluation, playback, training
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
@@ -174,7 +174,8 @@ def _figures(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
     yield _similarity(demos, RHO_BETAS, [(beta, PAPER_P) for beta in SWEEP_BETAS])
     for policy in settings.choose_policies(("zbc", "wzbc")):
         trained = training(settings, demos, policy)
-        yield Cell("styles", Labels(demos.name, policy, "styles"), {"env": demos.env}, trained)
+        definition = {"env": whole_environment(demos.env)}
+        yield Cell("styles", Labels(demos.name, policy, "styles"), definition, trained)
     if "wzbc" not in settings.choose_policies(STACKED):
         return
     sweep = [{"beta": beta, "p": PAPER_P} for beta in SWEEP_BETAS]
@@ -191,7 +192,7 @@ def _similarity(
 ) -> Cell:
     definition = {
         "fingerprint": demos.fingerprint,
-        "env": demos.env,
+        "env": whole_environment(demos.env),
         "references": REFERENCES,
         "betas": list(betas),
         "teaching": [list(pair) for pair in teaching],
