@@ -26,7 +26,7 @@ from lerobot_swr.reproduction.measurement import environment_seed
 from lerobot_swr.reproduction.planning import format_states, format_work, unfinished_chains
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
 from lerobot_swr.reproduction.suites import suite_cells
-from lerobot_swr.reproduction.training import checkpoint_folder
+from lerobot_swr.reproduction.training import _keep_the_last_checkpoint, checkpoint_folder
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -138,6 +138,17 @@ def test_every_cell_about_an_environment_holds_all_of_its_options(settings, demo
     named = {cell.kind: cell for cell in (demos.cell, *figures)}
     for kind in ("dataset", "similarity", "styles", "evaluate"):
         assert named[kind].definition["env"]["episode_length"] == 200
+
+
+def test_only_the_last_checkpoint_of_a_training_is_kept(tmp_path):
+    """Also where a killed run has left a half-made link."""
+    checkpoints = tmp_path / "checkpoints"
+    for step in ("000010", "000020"):
+        (checkpoints / step).mkdir(parents=True)
+    (checkpoints / "last").symlink_to("000020")
+    (checkpoints / ".last.7").symlink_to("000010")
+    _keep_the_last_checkpoint(tmp_path)
+    assert sorted(path.name for path in checkpoints.iterdir()) == ["000020", "last"]
 
 
 def test_names_tell_what_differs(settings, demos):
