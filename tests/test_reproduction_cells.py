@@ -122,6 +122,31 @@ def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
 
 
 def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
+def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
+    """Of unperturbed policies, which keep paths for pictures; those of other options keep none."""
+    lengths = (75,) * len(demos.lengths)
+    settings = dataclasses.replace(settings, sweep_steps=settings.steps, sweep_seeds=settings.seeds)
+    suites = {
+        name: [
+            cell
+            for cell in suite_cells(name, settings, [dataclasses.replace(demos, lengths=lengths)])
+            if cell.kind == "evaluate" and cell.labels.condition == "deterministic" and cell.needs
+        ]
+        for name in ("table1", "robustness", "contracting", "control", "figures")
+    }
+    of_wzbc = [
+        {cell.key for cell in cells if cell.labels.policy == "wzbc hidden_dim=16"}
+        for cells in suites.values()
+    ]
+    assert len(set.union(*of_wzbc)) == 1
+    assert all(cell.definition["paths"] for cell in suites["table1"])
+    others = [
+        cell for cell in suites["figures"] if "=" in cell.labels.policy.removeprefix("wzbc hidden_dim=16")
+    ]
+    assert len(others) == 7
+    assert not any(cell.definition["paths"] for cell in others)
+
+
     """Whole configurations are compared; every option that differs makes another cell."""
     trained = training(settings, demos, "zbc")
     plain = evaluation(settings, demos, trained, "x")
@@ -176,7 +201,7 @@ def test_an_interrupted_measurement_goes_on_with_its_next_part(
     settings, demos, store, trained, monkeypatch, tmp_path
 ):
     """Interrupted after two of four parts: the other two are made, and the result is that of a whole run."""
-    one = evaluation(settings, demos, trained, "deterministic", paths=True)
+    one = evaluation(settings, demos, trained, "deterministic")
     run, calls = measurement.run_rollouts, []
 
     def counted(*args, **kwargs):

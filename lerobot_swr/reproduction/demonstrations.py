@@ -100,7 +100,7 @@ def environment(options: Mapping[str, Any]) -> TaskEnvConfig:
 
 
 def whole_environment(options: Mapping[str, Any]) -> dict[str, Any]:
-    """All options of an environment, as cells hold them, so that a default that changes makes another cell."""
+    """All options of an environment, as cells hold them: a default that changes makes another cell."""
     return draccus.encode(environment(options), EnvConfig)
 
 
