@@ -26,7 +26,7 @@ from lerobot_swr.reproduction.measurement import environment_seed
 from lerobot_swr.reproduction.planning import format_states, format_work, unfinished_chains
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
 from lerobot_swr.reproduction.suites import suite_cells
-from lerobot_swr.reproduction.training import checkpoint_folder
+from lerobot_swr.reproduction.training import _keep_the_last_checkpoint, checkpoint_folder
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -122,6 +122,31 @@ def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
 
 
 def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
+def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
+    """Of unperturbed policies, which keep paths for pictures; those of other options keep none."""
+    lengths = (75,) * len(demos.lengths)
+    settings = dataclasses.replace(settings, sweep_steps=settings.steps, sweep_seeds=settings.seeds)
+    suites = {
+        name: [
+            cell
+            for cell in suite_cells(name, settings, [dataclasses.replace(demos, lengths=lengths)])
+            if cell.kind == "evaluate" and cell.labels.condition == "deterministic" and cell.needs
+        ]
+        for name in ("table1", "robustness", "contracting", "control", "figures")
+    }
+    of_wzbc = [
+        {cell.key for cell in cells if cell.labels.policy == "wzbc hidden_dim=16"}
+        for cells in suites.values()
+    ]
+    assert len(set.union(*of_wzbc)) == 1
+    assert all(cell.definition["paths"] for cell in suites["table1"])
+    others = [
+        cell for cell in suites["figures"] if "=" in cell.labels.policy.removeprefix("wzbc hidden_dim=16")
+    ]
+    assert len(others) == 7
+    assert not any(cell.definition["paths"] for cell in others)
+
+
     """Whole configurations are compared; every option that differs makes another cell."""
     trained = training(settings, demos, "zbc")
     plain = evaluation(settings, demos, trained, "x")
@@ -130,6 +155,25 @@ def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
     for option in ({"transition_noise": 1.0}, {"episode_length": 150}, {"sticky_walls": True}):
         assert evaluation(settings, demos, trained, "x", option).key != plain.key
     assert plain.definition["env"]["episode_length"] == 200
+
+
+def test_every_cell_about_an_environment_holds_all_of_its_options(settings, demos):
+    """So that no result of an older default is taken for one of the new default."""
+    figures = suite_cells("figures", settings, [demos])
+    named = {cell.kind: cell for cell in (demos.cell, *figures)}
+    for kind in ("dataset", "similarity", "styles", "evaluate"):
+        assert named[kind].definition["env"]["episode_length"] == 200
+
+
+def test_only_the_last_checkpoint_of_a_training_is_kept(tmp_path):
+    """Also where a killed run has left a half-made link."""
+    checkpoints = tmp_path / "checkpoints"
+    for step in ("000010", "000020"):
+        (checkpoints / step).mkdir(parents=True)
+    (checkpoints / "last").symlink_to("000020")
+    (checkpoints / ".last.7").symlink_to("000010")
+    _keep_the_last_checkpoint(tmp_path)
+    assert sorted(path.name for path in checkpoints.iterdir()) == ["000020", "last"]
 
 
 def test_names_tell_what_differs(settings, demos):
@@ -157,7 +201,7 @@ def test_an_interrupted_measurement_goes_on_with_its_next_part(
     settings, demos, store, trained, monkeypatch, tmp_path
 ):
     """Interrupted after two of four parts: the other two are made, and the result is that of a whole run."""
-    one = evaluation(settings, demos, trained, "deterministic", paths=True)
+    one = evaluation(settings, demos, trained, "deterministic")
     run, calls = measurement.run_rollouts, []
 
     def counted(*args, **kwargs):

@@ -45,7 +45,8 @@ class Demonstrations:
     @property
     def cell(self) -> Cell:
         """The cell that holds the dataset's description."""
-        return Cell("dataset", Labels(self.name, "", ""), {"fingerprint": self.fingerprint, "env": self.env})
+        definition = {"fingerprint": self.fingerprint, "env": whole_environment(self.env)}
+        return Cell("dataset", Labels(self.name, "", ""), definition)
 
 
 def prepare(name: str, folder: Path, store: Store) -> Demonstrations:
@@ -96,6 +97,11 @@ def environment(options: Mapping[str, Any]) -> TaskEnvConfig:
     config = draccus.decode(EnvConfig, dict(options))
     assert isinstance(config, TaskEnvConfig)
     return config
+
+
+def whole_environment(options: Mapping[str, Any]) -> dict[str, Any]:
+    """All options of an environment, as cells hold them: a default that changes makes another cell."""
+    return draccus.encode(environment(options), EnvConfig)
 
 
 def short_path(path: np.ndarray) -> list[list[float]]:

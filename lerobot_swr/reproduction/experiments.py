@@ -10,11 +10,10 @@ from typing import Any
 
 import draccus
 from lerobot.configs import PreTrainedConfig
-from lerobot.envs import EnvConfig
 
 from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.demonstrations import Demonstrations, whole_environment
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
 
@@ -88,9 +87,11 @@ def evaluation(
     env: Mapping[str, Any] | None = None,
     protocols: Sequence[str] = ("uniform", "stratified"),
     style_filter: str | None = None,
-    paths: bool = False,
 ) -> Cell:
     """An evaluation cell on a training.
+
+    Of what ``table1`` asks for, in whatever suite, it keeps the paths of the first seed's last rollouts, for
+    pictures: a policy as the settings train it, the environment as it is, all styles.
 
     Args:
         settings: Number of rollouts.
@@ -100,13 +101,15 @@ def evaluation(
         env: Options of the environment beyond its type and task.
         protocols: Ways of drawing styles; policies without styles are rolled out once.
         style_filter: Only styles of demonstrations that match.
-        paths: Keep the paths of the first seed's last rollouts, for pictures.
     """
-    has_styles = hasattr(PreTrainedConfig.get_choice_class(trained.definition["policy"]), "style_sampling")
+    policy = trained.definition["policy"]
+    has_styles = hasattr(PreTrainedConfig.get_choice_class(policy), "style_sampling")
+    rolled_out = _rolled_out(settings, demos, env, protocols if has_styles else ("uniform",))
+    pictured = style_filter is None and rolled_out["env"] == whole_environment(demos.env)
     definition = {
-        **_rolled_out(settings, demos, env, protocols if has_styles else ("uniform",)),
+        **rolled_out,
         "style_filter": style_filter,
-        "paths": paths,
+        "paths": pictured and trained == training(settings, demos, policy),
     }
     return Cell("evaluate", Labels(demos.name, trained.labels.policy, condition), definition, trained)
 
@@ -149,7 +152,7 @@ def _rolled_out(
     """What defines rollouts apart from who acts."""
     stratified = _stratified_rollouts(settings.n_rollouts, len(demos.lengths))
     return {
-        "env": draccus.encode(environment({**demos.env, **(env or {})}), EnvConfig),
+        "env": whole_environment({**demos.env, **(env or {})}),
         "protocols": {p: stratified if p == "stratified" else settings.n_rollouts for p in protocols},
         "seed": EVALUATION_SEED,
     }

@@ -5,7 +5,7 @@ from typing import Any
 
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations, environment
+from lerobot_swr.reproduction.demonstrations import Demonstrations, environment, whole_environment
 from lerobot_swr.reproduction.experiments import evaluation, playback, training
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
@@ -39,11 +39,12 @@ DATASETS = {
 Conditions = dict[str, tuple[dict[str, Any], tuple[str, ...]]]
 """Name to the options of the environment and the ways of drawing styles."""
 
+UNPERTURBED = "deterministic"
 BOTH_PROTOCOLS = ("uniform", "stratified")
 
 # --- Robustness (the paper's Table 2) ---
 CONDITIONS: dict[str, dict[str, Any]] = {
-    "deterministic": {},
+    UNPERTURBED: {},
     "pseudo-random start": {"start": "pseudo_random", "start_radius": 0.10},
     "random start": {"start": "random"},
     "transition noise": {"transition_noise": 1.0},
@@ -55,7 +56,6 @@ ROBUST_WZBC: tuple[dict[str, Any], ...] = ({"p": 0.95}, {"beta": 3.0})
 ROBUST_WZBC_DATASETS = ("medium_maze-spread_out",)
 
 # --- Contracting styles: beyond the paper, docs/contracting.md ---
-UNPERTURBED = "deterministic"
 STICKY_WALLS: dict[str, dict[str, Any]] = {
     "sticky walls": {"sticky_walls": True},
     "sticky walls, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
@@ -88,20 +88,19 @@ def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[D
 
 def _table1(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
     for policy in settings.choose_policies(known_policies()):
-        yield evaluation(settings, demos, training(settings, demos, policy), "deterministic", paths=True)
+        yield evaluation(settings, demos, training(settings, demos, policy), UNPERTURBED)
 
 
 def _robustness(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
     if demos.env["type"] != "maze2d":
         raise ValueError(f"datasets: {demos.name!r} is no maze; robustness perturbs mazes only")
-    trained = {training(settings, demos, policy): True for policy in settings.choose_policies(STACKED)}
+    trained = [training(settings, demos, policy) for policy in settings.choose_policies(STACKED)]
     variants = ROBUST_WZBC if demos.name in ROBUST_WZBC_DATASETS else ()
     if "wzbc" in settings.choose_policies(STACKED):
-        trained |= {training(settings, demos, "wzbc", options): False for options in variants}
-    for one, in_table1 in trained.items():
+        trained += [training(settings, demos, "wzbc", options) for options in variants]
+    for one in dict.fromkeys(trained):
         for name, (env, protocols) in _maze_conditions().items():
-            paths = in_table1 and name == UNPERTURBED  # the same cell
-            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
+            yield evaluation(settings, demos, one, name, env, protocols)
     values = [{"beta": PAPER_BETA, "p": PAPER_P, **options} for options in ({}, *variants)]
     yield _similarity(demos, (), [(v["beta"], v["p"]) for v in values])
 
@@ -139,13 +138,12 @@ def _contracting(settings: ReproductionSettings, demos: Demonstrations) -> Itera
     chosen = settings.choose_policies(("zbc", "wzbc"))
     if not chosen:
         return
-    trained = {training(settings, demos, policy): True for policy in chosen}
+    trained = [training(settings, demos, policy) for policy in chosen]
     if "zbc" in chosen:
-        trained |= {training(settings, demos, "zbc", {"corrective": kind}): False for kind in CORRECTIVE}
-    for one, in_table1 in trained.items():
+        trained += [training(settings, demos, "zbc", {"corrective": kind}) for kind in CORRECTIVE]
+    for one in dict.fromkeys(trained):
         for name, (env, protocols) in perturbations(demos).items():
-            paths = in_table1 and name == UNPERTURBED  # the same cell
-            yield evaluation(settings, demos, one, name, env, protocols, paths=paths)
+            yield evaluation(settings, demos, one, name, env, protocols)
     for name, (env, protocols) in perturbations(demos).items():
         yield playback(settings, demos, name, env, protocols)
 
@@ -158,7 +156,7 @@ def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
         )
     for policy in settings.choose_policies(STACKED):
         trained = training(settings, demos, policy)
-        yield evaluation(settings, demos, trained, "deterministic")
+        yield evaluation(settings, demos, trained, UNPERTURBED)
         if policy != "bc":
             yield evaluation(
                 settings,
@@ -174,7 +172,8 @@ def _figures(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
     yield _similarity(demos, RHO_BETAS, [(beta, PAPER_P) for beta in SWEEP_BETAS])
     for policy in settings.choose_policies(("zbc", "wzbc")):
         trained = training(settings, demos, policy)
-        yield Cell("styles", Labels(demos.name, policy, "styles"), {"env": demos.env}, trained)
+        definition = {"env": whole_environment(demos.env)}
+        yield Cell("styles", Labels(demos.name, policy, "styles"), definition, trained)
     if "wzbc" not in settings.choose_policies(STACKED):
         return
     sweep = [{"beta": beta, "p": PAPER_P} for beta in SWEEP_BETAS]
@@ -183,7 +182,7 @@ def _figures(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
         trained = training(
             settings, demos, "wzbc", options, steps=settings.sweep_steps, seeds=settings.sweep_seeds
         )
-        yield evaluation(settings, demos, trained, "deterministic")
+        yield evaluation(settings, demos, trained, UNPERTURBED)
 
 
 def _similarity(
@@ -191,7 +190,7 @@ def _similarity(
 ) -> Cell:
     definition = {
         "fingerprint": demos.fingerprint,
-        "env": demos.env,
+        "env": whole_environment(demos.env),
         "references": REFERENCES,
         "betas": list(betas),
         "teaching": [list(pair) for pair in teaching],

@@ -114,5 +114,9 @@ def _flag(value: Any) -> str:
 def _keep_the_last_checkpoint(run: Path) -> None:
     last = (run / "checkpoints" / "last").resolve().name
     for folder in (run / "checkpoints").iterdir():
-        if folder.name not in ("last", last):
+        if folder.name in ("last", last):
+            continue
+        if folder.is_symlink():  # left by a run that was killed while it moved "last"
+            folder.unlink()
+        else:
             shutil.rmtree(folder)
