@@ -122,7 +122,6 @@ def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
     assert len(set.union(*wzbc)) == len(wzbc[2])
 
 
-def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
 def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
     """Of unperturbed policies, which keep paths for pictures; those of other options keep none."""
     lengths = (75,) * len(demos.lengths)
@@ -148,6 +147,7 @@ def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
     assert not any(cell.definition["paths"] for cell in others)
 
 
+def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
     """Whole configurations are compared; every option that differs makes another cell."""
     trained = training(settings, demos, "zbc")
     plain = evaluation(settings, demos, trained, "x")
@@ -428,13 +428,21 @@ def test_the_work_that_is_left_is_counted(settings, demos, store, trained):
     wzbc = training(settings, demos, "wzbc")
     cells = [trained, wzbc, *(evaluation(settings, demos, one, "x") for one in (trained, wzbc))]
     assert format_work(cells, store) == (
-        "left: 40 seed-steps in 1 trainings by lerobot-swr-train, "
-        "0 seed-steps in 0 trainings by lerobot-train, 96 rollouts in 2 evaluations"
+        "left: 40 seed-steps in 1 trainings of stacked seeds, "
+        "0 seed-steps in 0 trainings by LeRobot's loop, 96 rollouts in 2 evaluations"
     )
     half = store.work_folder(wzbc) / "run" / "seed_0" / "checkpoints" / "000010"
     half.mkdir(parents=True)
     assert "left: 30 seed-steps" in format_work(cells, store)
     assert format_work([trained], store).startswith("left: 0 seed-steps in 0 trainings")
+
+
+def test_long_trainings_come_first(demos, store):
+    """100,000 steps of five stacked seeds take longer than ACT's two seeds, and less than Diffusion's."""
+    pytest.importorskip("diffusers")
+    trainings = [training(ReproductionSettings(), demos, policy) for policy in ("act", "zbc", "diffusion")]
+    ordered = [one.definition["policy"] for [one] in unfinished_chains(trainings, store)]
+    assert ordered == ["diffusion", "zbc", "act"]
 
 
 def test_policies_without_styles_are_rolled_out_once(settings, demos):
