@@ -23,7 +23,9 @@ PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy")
 
 @dataclass(frozen=True)
 class Labels:
-    """How tables and pictures call a cell; no part of its identity.
+    """How tables and pictures call a cell; no part of its identity, but of its files' names.
+
+    So a dataset by another name is computed anew: its results and checkpoints are looked for under that name.
 
     Attributes:
         dataset: Name of the dataset.
@@ -175,13 +177,13 @@ class Store:
             os.close(descriptor)
 
 
-def _plain(value: Any) -> Any:
-    """JSON values in which 1 and 1.0, a tuple and a list are the same."""
 def this_command() -> str:
     """Host and number of this process, which tell commands apart that work on one store."""
     return f"{socket.gethostname()} {os.getpid()}"
 
 
+def _plain(value: Any) -> Any:
+    """JSON values in which 1 and 1.0, a tuple and a list are the same."""
     if isinstance(value, Mapping):
         return {str(key): _plain(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
