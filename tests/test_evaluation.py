@@ -211,3 +211,15 @@ def test_missing_folders_and_foreign_datasets_are_named(
         with pytest.raises(SystemExit):
             evaluate(run_command, policy, root, tmp_path / "out", *ENV)
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["n_episodes", "batch_size"])
+@pytest.mark.parametrize("in_file", [True, False])
+def test_options_of_rollouts_are_refused_offline(run_command, tmp_path, capsys, key, in_file):
+    """Whether they are on the command line or in a file."""
+    file = tmp_path / "flags.yaml"
+    file.write_text(f"{key}: 7\n")
+    given = f"--config_path={file}" if in_file else f"--{key}=100"
+    with pytest.raises(SystemExit):
+        run_command(eval_command.main, given, f"--policy.path={tmp_path}", f"--dataset.root={tmp_path}")
+    assert f"--{key}: this is about rollouts in an environment" in capsys.readouterr().err

@@ -1,5 +1,6 @@
 """Cells of the paper's experiments: identity, storage, resuming, failures."""
 
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -18,7 +19,7 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_swr.reproduction import execution, measurement
 from lerobot_swr.reproduction.baselines import BASELINES, known_policies
-from lerobot_swr.reproduction.cells import Cell, Labels, Store
+from lerobot_swr.reproduction.cells import Cell, Labels, Store, this_command
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.execution import run_cells, run_chain
 from lerobot_swr.reproduction.experiments import evaluation, playback, training, variant_name
@@ -121,7 +122,6 @@ def test_the_same_training_is_one_cell_whoever_asks_for_it(settings, demos):
     assert len(set.union(*wzbc)) == len(wzbc[2])
 
 
-def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
 def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
     """Of unperturbed policies, which keep paths for pictures; those of other options keep none."""
     lengths = (75,) * len(demos.lengths)
@@ -147,6 +147,7 @@ def test_the_same_measurement_is_one_cell_whoever_asks_for_it(settings, demos):
     assert not any(cell.definition["paths"] for cell in others)
 
 
+def test_an_environment_option_at_its_default_changes_nothing(settings, demos):
     """Whole configurations are compared; every option that differs makes another cell."""
     trained = training(settings, demos, "zbc")
     plain = evaluation(settings, demos, trained, "x")
@@ -213,16 +214,16 @@ def test_an_interrupted_measurement_goes_on_with_its_next_part(
     monkeypatch.setattr(measurement, "run_rollouts", counted)
     roots = {demos.name: demos.root}
     with pytest.raises(KeyboardInterrupt):
-        run_chain([one], store, roots)
+        run_chain([one], store, roots, "me")
     assert not store.is_done(one)
     monkeypatch.setattr(measurement, "run_rollouts", lambda *a, **k: calls.append(a) or run(*a, **k))
-    assert run_chain([one], store, roots) == []
+    assert run_chain([one], store, roots, "me") == []
     assert len(calls) == 4
 
     whole = Store(tmp_path / "whole")
     (whole.root / "work").mkdir(parents=True)
     os.symlink(store.work_folder(trained), whole.work_folder(trained))
-    assert run_chain([one], whole, roots) == []
+    assert run_chain([one], whole, roots, "me") == []
     assert whole.read(one) == store.read(one)
 
 
@@ -307,6 +308,25 @@ def test_a_killed_worker_fails_the_cell_that_killed_it_alone(demos, store, monke
     assert "killed" in failure.message
     assert [store.state(one) for one in cells] == ["done", "failed", "done", "done"]
     assert "killed" in failure.log.read_text()
+
+
+def test_another_commands_note_of_what_it_computes_is_left_alone(demos, store, monkeypatch):
+    """Two commands on one store: neither ends, nor takes for its own, what the other has begun."""
+    theirs = Cell("similarity", Labels(demos.name, "", "theirs"), {})
+    monkeypatch.setattr(execution, "_compute", lambda *_: pytest.fail("computed twice"))
+
+    @contextlib.contextmanager
+    def wait_for_the_other_command(self, one):
+        self.write(one, {}, 0.0)
+        yield 0
+
+    store.begin(theirs, "elsewhere 7")
+    monkeypatch.setattr(Store, "lock", wait_for_the_other_command)
+    assert run_cells([theirs], store, {demos.name: demos}, jobs=1) == []
+    assert store.is_running(theirs, "elsewhere 7")
+    assert not store.is_running(theirs, this_command())
+    store.end(theirs, "elsewhere 7")
+    assert not store.is_running(theirs, "elsewhere 7")
 
 
 def test_training_seeds_never_share_an_environment_seed():
@@ -408,13 +428,21 @@ def test_the_work_that_is_left_is_counted(settings, demos, store, trained):
     wzbc = training(settings, demos, "wzbc")
     cells = [trained, wzbc, *(evaluation(settings, demos, one, "x") for one in (trained, wzbc))]
     assert format_work(cells, store) == (
-        "left: 40 seed-steps in 1 trainings by lerobot-swr-train, "
-        "0 seed-steps in 0 trainings by lerobot-train, 96 rollouts in 2 evaluations"
+        "left: 40 seed-steps in 1 trainings of stacked seeds, "
+        "0 seed-steps in 0 trainings by LeRobot's loop, 96 rollouts in 2 evaluations"
     )
     half = store.work_folder(wzbc) / "run" / "seed_0" / "checkpoints" / "000010"
     half.mkdir(parents=True)
     assert "left: 30 seed-steps" in format_work(cells, store)
     assert format_work([trained], store).startswith("left: 0 seed-steps in 0 trainings")
+
+
+def test_long_trainings_come_first(demos, store):
+    """100,000 steps of five stacked seeds take longer than ACT's two seeds, and less than Diffusion's."""
+    pytest.importorskip("diffusers")
+    trainings = [training(ReproductionSettings(), demos, policy) for policy in ("act", "zbc", "diffusion")]
+    ordered = [one.definition["policy"] for [one] in unfinished_chains(trainings, store)]
+    assert ordered == ["diffusion", "zbc", "act"]
 
 
 def test_policies_without_styles_are_rolled_out_once(settings, demos):

@@ -119,7 +119,8 @@ class EvalCommand:
             "length_band": self.length_band is not None,
             "style_sampling": self.style_sampling is not None,
             "behavior_rule": self.behavior_rule is not None,
-            "n_episodes": parser.parse_arg("n_episodes") is not None,
+            "n_episodes": self._is_given("n_episodes"),
+            "batch_size": self._is_given("batch_size"),
             "dataset.episodes": self.dataset.episodes is not None,
             "rename_map": bool(self.rename_map),
             "baseline": self.baseline is not None,
@@ -127,6 +128,10 @@ class EvalCommand:
             "policy.*": self.policy is not None or bool(_policy_overrides()),
         }
         refuse_conflicts([key for key, is_given in given.items() if is_given], self.env is not None)
+
+    def _is_given(self, key: str) -> bool:
+        """Whether an option is on the command line, or a --config_path file sets it to another value."""
+        return parser.parse_arg(key) is not None or getattr(self, key) != getattr(EvalCommand, key)
 
     def _find_policy(self) -> None:
         path = parser.get_path_arg("policy")

@@ -19,7 +19,7 @@ CONFLICTS = {
 }
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),
-    *("style_sampling", "behavior_rule", "n_episodes"),
+    *("style_sampling", "behavior_rule", "n_episodes", "batch_size"),
 )
 
 

@@ -19,12 +19,14 @@ class Baseline:
         options: What differs from its defaults: networks that a CPU trains, as in ``configs/``.
         batch_size: Frames per step.
         steps: Name of the setting that holds its steps.
+        slowness: Time of a seed's step in steps of a stacked seed, roughly; it orders the trainings.
         extra: What installs ``diffusers``, without which it cannot be trained; None does not need it.
     """
 
     options: Mapping[str, Any]
     batch_size: int
     steps: str = "baseline_steps"
+    slowness: int = 60
     extra: str | None = "lerobot_policy_swr[baselines]"
 
 
@@ -52,6 +54,7 @@ BASELINES = {
         },
         batch_size=32,
         steps="act_steps",
+        slowness=15,
         extra=None,
     ),
     "diffusion": Baseline(

@@ -8,6 +8,7 @@ import fcntl
 import hashlib
 import json
 import os
+import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,9 @@ PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy")
 
 @dataclass(frozen=True)
 class Labels:
-    """How tables and pictures call a cell; no part of its identity.
+    """How tables and pictures call a cell; no part of its identity, but of its files' names.
+
+    So a dataset by another name is computed anew: its results and checkpoints are looked for under that name.
 
     Attributes:
         dataset: Name of the dataset.
@@ -120,9 +123,21 @@ class Store:
         """The file that is there while the cell is computed, and stays if that is killed."""
         return self.work_folder(cell) / "running"
 
-    def is_running(self, cell: Cell) -> bool:
-        """Whether an attempt has begun and not come to an end."""
-        return self.running_path(cell).is_file()
+    def begin(self, cell: Cell, command: str) -> None:
+        """Note that a command computes the cell; see `this_command`."""
+        write_text(self.running_path(cell), command)
+
+    def is_running(self, cell: Cell, command: str) -> bool:
+        """Whether an attempt of this command, and not of another one on the same store, has not ended."""
+        try:
+            return self.running_path(cell).read_text() == command
+        except FileNotFoundError:
+            return False
+
+    def end(self, cell: Cell, command: str) -> None:
+        """Take the command's own note back."""
+        if self.is_running(cell, command):
+            self.running_path(cell).unlink(missing_ok=True)
 
     def read(self, cell: Cell) -> dict[str, Any]:
         """The result of a finished cell."""
@@ -160,6 +175,11 @@ class Store:
             yield descriptor
         finally:
             os.close(descriptor)
+
+
+def this_command() -> str:
+    """Host and number of this process, which tell commands apart that work on one store."""
+    return f"{socket.gethostname()} {os.getpid()}"
 
 
 def _plain(value: Any) -> Any:

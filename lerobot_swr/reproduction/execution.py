@@ -14,7 +14,7 @@ import torch
 from joblib import Parallel, delayed
 
 from lerobot_swr.reproduction.baselines import known_policies, missing_extras
-from lerobot_swr.reproduction.cells import Cell, Store, write_text
+from lerobot_swr.reproduction.cells import Cell, Store, this_command, write_text
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
 from lerobot_swr.reproduction.planning import (
@@ -92,7 +92,8 @@ def run_cells(
 
     A training and everything measured on it form a chain, which one worker goes through; chains run in
     parallel. If a worker process is killed (out of memory, say), those chains that were under way are run
-    again, one at a time after all others; whichever kills its worker again has failed.
+    again, one at a time after all others; whichever kills its worker again has failed. Another command may
+    work on the same store at the same time.
 
     Args:
         cells: The cells, in any order.
@@ -100,24 +101,30 @@ def run_cells(
         datasets: The datasets by name.
         jobs: Workers; None takes joblib's active configuration.
     """
+    command = this_command()
     chains = unfinished_chains(cells, store)
     workers = {} if jobs is None else {"n_jobs": jobs}
     roots = {name: demos.root.resolve() for name, demos in datasets.items()}
     for cell in (cell for chain in chains for cell in chain):
         store.failure_path(cell).unlink(missing_ok=True)
-        store.running_path(cell).unlink(missing_ok=True)
+        store.end(cell, command)  # of a killed process that had the same number
     failures: dict[Cell, Failure] = {}
+
+    def is_running(cell: Cell) -> bool:
+        return store.is_running(cell, command)
 
     def attempt(chosen: list[list[Cell]]) -> list[list[Cell]]:
         """Run chains; those that were under way when a worker was killed."""
         try:
-            outcomes = Parallel(**workers)(delayed(run_chain)(chain, store, roots) for chain in chosen)
+            outcomes = Parallel(**workers)(
+                delayed(run_chain)(chain, store, roots, command) for chain in chosen
+            )
             failures.update({failure.cell: failure for of_chain in outcomes for failure in of_chain})
             return []
         except BrokenProcessPool:
             known = [cell for chain in chosen for cell in chain if store.failure_path(cell).is_file()]
             failures.update({cell: _stored_failure(cell, store) for cell in known})
-            under_way = [chain for chain in chosen if any(map(store.is_running, chain))]
+            under_way = [chain for chain in chosen if any(map(is_running, chain))]
             return under_way or chosen[:1]
 
     with progress([cell for chain in chains for cell in chain], store):
@@ -130,8 +137,10 @@ def run_cells(
         for chain in alone:
             while chain := _left_of(chain, store, failures):
                 if attempt([chain]):
-                    culprit = next(filter(store.is_running, chain), chain[0])
-                    failures[culprit] = _failed(culprit, store, "its worker process was killed twice")
+                    culprit = next(filter(is_running, chain), chain[0])
+                    failures[culprit] = _failed(
+                        culprit, store, command, "its worker process was killed twice"
+                    )
     return list(failures.values())
 
 
@@ -142,11 +151,20 @@ def _left_of(chain: Sequence[Cell], store: Store, failures: Mapping[Cell, Failur
     return [cell for cell in chain if cell not in failures and not is_finished(cell, store)]
 
 
-def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path]) -> list[Failure]:
-    """Compute the cells of a chain one after the other, up to the first training that fails."""
+def run_chain(
+    chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path], command: str
+) -> list[Failure]:
+    """Compute the cells of a chain one after the other, up to the first training that fails.
+
+    Args:
+        chain: The cells.
+        store: Where results go.
+        datasets: Folders of the datasets by name.
+        command: What `this_command` is in the process that started the workers.
+    """
     failures = []
     for cell in chain:
-        failure = _run_cell(cell, store, datasets[cell.labels.dataset])
+        failure = _run_cell(cell, store, datasets[cell.labels.dataset], command)
         if failure is not None:
             failures.append(failure)
             if cell.kind == "train":
@@ -154,13 +172,13 @@ def run_chain(chain: Sequence[Cell], store: Store, datasets: Mapping[str, Path])
     return failures
 
 
-def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
+def _run_cell(cell: Cell, store: Store, dataset: Path, command: str) -> Failure | None:
     try:
         with store.lock(cell) as lock:
             if is_finished(cell, store):  # by another command meanwhile
                 return None
             store.failure_path(cell).unlink(missing_ok=True)
-            store.running_path(cell).touch()
+            store.begin(cell, command)
             start = time.monotonic()
             with (
                 store.log_path(cell).open("a") as log,
@@ -169,16 +187,17 @@ def _run_cell(cell: Cell, store: Store, dataset: Path) -> Failure | None:
             ):
                 result = _compute(cell, store, dataset, lock)
             store.write(cell, result, time.monotonic() - start)
-            store.running_path(cell).unlink(missing_ok=True)
+            store.end(cell, command)
             return None
     except Exception as error:
-        return _failed(cell, store, f"{type(error).__name__}: {error}", traceback.format_exc())
+        message = f"{type(error).__name__}: {error}"
+        return _failed(cell, store, command, message, traceback.format_exc())
 
 
-def _failed(cell: Cell, store: Store, message: str, details: str = "") -> Failure:
+def _failed(cell: Cell, store: Store, command: str, message: str, details: str = "") -> Failure:
     """Note a failure; where even that cannot be written (disk full), the command still names it."""
     with contextlib.suppress(OSError):
-        store.running_path(cell).unlink(missing_ok=True)
+        store.end(cell, command)
         write_text(store.failure_path(cell), message + "\n")
         with store.log_path(cell).open("a") as log:
             log.write(details or message + "\n")

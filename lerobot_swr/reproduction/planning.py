@@ -7,10 +7,9 @@ from collections.abc import Iterator, Sequence
 
 from tqdm import tqdm
 
+from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done
-
-LEROBOT_TRAIN_SLOWNESS = 15  # roughly, per seed and step; only for the order of the trainings
 
 
 def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
@@ -32,8 +31,11 @@ def unfinished_chains(cells: Sequence[Cell], store: Store) -> list[list[Cell]]:
         root = chain[0]
         if root.kind != "train":
             return 0
-        seed_steps = root.definition["steps"] * len(root.definition["seeds"])
-        return seed_steps if root.definition["policy"] in STACKED else LEROBOT_TRAIN_SLOWNESS * seed_steps
+        seed_steps, policy = (
+            root.definition["steps"] * len(root.definition["seeds"]),
+            root.definition["policy"],
+        )
+        return seed_steps if policy in STACKED else BASELINES[policy].slowness * seed_steps
 
     return sorted(chains, key=work, reverse=True)
 
@@ -51,13 +53,13 @@ def format_work(cells: Sequence[Cell], store: Store) -> str:
     left = [cell for chain in unfinished_chains(cells, store) for cell in chain]
     trainings = [cell for cell in left if cell.kind == "train"]
     lines = []
-    for command, stacked in (("lerobot-swr-train", True), ("lerobot-train", False)):
+    for stacked, how in ((True, "of stacked seeds"), (False, "by LeRobot's loop")):
         chosen = [cell for cell in trainings if (cell.definition["policy"] in STACKED) == stacked]
         seed_steps = sum(
             round(cell.definition["steps"] * len(cell.definition["seeds"]) * (1 - steps_done(cell, store)))
             for cell in chosen
         )
-        lines.append(f"{seed_steps:,} seed-steps in {len(chosen)} trainings by {command}")
+        lines.append(f"{seed_steps:,} seed-steps in {len(chosen)} trainings {how}")
     evaluations = [cell for cell in left if cell.kind == "evaluate"]
     rollouts = sum(
         sum(cell.definition["protocols"].values()) * len((cell.needs or cell).definition["seeds"])

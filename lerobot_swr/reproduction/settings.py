@@ -26,8 +26,8 @@ class ReproductionSettings:
     # Steps and seeds of the sweeps over beta and p (figures).
     sweep_steps: int = 30_000
     sweep_seeds: int = 2
-    # Steps (of each policy's own batch size) and seeds of the other policies, which lerobot-train trains one
-    # seed after the other.
+    # Steps (of each policy's own batch size) and seeds of the other policies, which LeRobot's own loop trains
+    # one seed after the other.
     act_steps: int = 10_000
     diffusion_steps: int = 10_000
     baseline_steps: int = 20_000
