@@ -440,8 +440,10 @@ def test_the_work_that_is_left_is_counted(settings, demos, store, trained):
 def test_long_trainings_come_first(demos, store):
     """100,000 steps of five stacked seeds take longer than ACT's two seeds, and less than Diffusion's."""
     pytest.importorskip("diffusers")
-    trainings = [training(ReproductionSettings(), demos, policy) for policy in ("act", "zbc", "diffusion")]
-    ordered = [one.definition["policy"] for [one] in unfinished_chains(trainings, store)]
+    settings = ReproductionSettings()
+    trainings = [training(settings, demos, policy) for policy in ("act", "zbc", "diffusion")]
+    measured = [evaluation(settings, demos, trained, "x") for trained in trainings]
+    ordered = [chain[0].definition["policy"] for chain in unfinished_chains(measured, store)]
     assert ordered == ["diffusion", "zbc", "act"]
 
 
