@@ -193,6 +193,31 @@ def test_corrective_frames_do_not_depend_on_how_many_are_drawn_together(small_ma
         torch.testing.assert_close(drawn[0][key], drawn[1][key], atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("size", [16, 5, 1])
+def test_before_all_episodes_are_seen_only_the_frames_asked_for_are_drawn(servo_dataset, monkeypatch, size):
+    """They are those of a whole block; many steps at once are the same as one by one, bit for bit."""
+    one, meta = make(servo_dataset, corrective="demos")
+    rows = every_frame(one)
+    seen = rows[rows < 3 * 90]  # of episodes 0 to 2
+    one.draw(batch_of(one, meta, seen))
+    many, labels, counts = copy.deepcopy(one), one.corrections.labels, []
+    draw = labels.draw
+    monkeypatch.setattr(labels, "draw", lambda u, candidates: counts.append(len(u)) or draw(u, candidates))
+    steps = seen[: 10 * size].view(10, size)
+    singly = [one.draw(batch_of(one, meta, step)) for step in steps]
+    at_once = many.draw(batch_of(many, meta, steps.flatten()), len(steps))
+    corrective = at_once["corrective"]
+    for key in ("style_episode", "weight", STATE, ACTION):
+        expected = torch.cat([drawn[key][drawn["corrective"]] for drawn in singly])
+        assert torch.equal(at_once[key][corrective], expected), key
+    assert sum(counts) == int(corrective.sum())
+    per_frame = labels.draws_per_frame
+    block = draw(one.corrections.draws.uniforms_at(0, 256, per_frame).reshape(256, per_frame), np.arange(3))
+    first = len(seen) // 2
+    expected = block.episodes[first : first + sum(counts)].tolist()
+    assert at_once["style_episode"][corrective].tolist() == expected
+
+
 def test_pairs_and_corrective_draws_are_independent(small_maze):
     """The streams of random numbers differ, and each step's differ from the last one's."""
     policy, _ = make(small_maze, "wzbc", corrective="noise")

@@ -2,6 +2,7 @@
 
 import logging
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -107,9 +108,9 @@ class Corrections(nn.Module):
     """The corrective part of a style policy; all in normalised units.
 
     Half of a batch is replaced by corrective frames. These do not depend on the batch: they are drawn from
-    all frames that are trained on, for many steps at once, because for the few of one step the overhead of
-    each operation would be noticeable. Frame n is a pure function of the seed and of the episodes trained on
-    so far, so a resumed run finds the same.
+    all frames that are trained on, for many steps at once as soon as every episode has been seen, because for
+    the few of one step the overhead of each operation would be noticeable. Frame n is a pure function of the
+    seed and of the episodes trained on so far, so a resumed run finds the same.
 
     Attributes:
         relative: Translates between actions and the network's outputs; None where it predicts actions.
@@ -186,7 +187,10 @@ class Corrections(nn.Module):
         self.draws.step.add_(count)  # `+=` would have the module register it anew
         device = drawn[ACTION].device
         places, corrective = self._half(count // steps, steps, first % 2, device)
-        frames = self._frames(first // 2, (first + count) // 2, trained, device)
+        if len(places) == 0:
+            return {**drawn, "corrective": corrective}
+        edges = (first + count // steps * np.arange(steps + 1)) // 2
+        frames = self._frames(edges, trained, device)
         replaced = {key: drawn[key].index_copy(0, places, value) for key, value in frames.items()}
         if "relabelled" in drawn:
             replaced["relabelled"] = drawn["relabelled"] & ~corrective
@@ -204,42 +208,55 @@ class Corrections(nn.Module):
             self._places = {**kept, key: value}
         return self._places[key]
 
-    def _frames(self, first: int, last: int, trained: Tensor, device: torch.device) -> dict[str, Tensor]:
-        """Corrective frames `first` to `last` - 1, as `draw` of a policy returns frames."""
-        marked = trained.cpu().numpy()
-        parts: list[dict[str, Tensor]] = []
-        while first < last or not parts:
-            block, place = divmod(first, BLOCK)
-            content = self._drawn_block(block, marked, device)
-            stop = min(place + last - first, BLOCK)
-            parts.append({key: value[place:stop] for key, value in content.items()})
-            first += stop - place
+    def _frames(self, edges: np.ndarray, trained: Tensor, device: torch.device) -> dict[str, Tensor]:
+        """Corrective frames of one step or more, as `draw` of a policy returns frames.
+
+        Step s has frames ``edges[s]`` to ``edges[s + 1]`` - 1; `trained` (N,) is not 0 where an episode was.
+        """
+        is_candidate = trained.cpu().numpy()[self._episodes] != 0
+        if is_candidate.all():
+            parts = self._from_blocks(int(edges[0]), int(edges[-1]), device)
+        else:
+            # A block would serve only until the next episode is seen. Rounding depends on how many frames are
+            # drawn together: a step's, however many steps are asked for.
+            candidates = np.flatnonzero(is_candidate)
+            spans = [(first, last - first) for first, last in pairwise(edges.tolist()) if last > first]
+            parts = [self._draw_frames(first, count, candidates, device) for first, count in spans]
         if len(parts) == 1:
             return parts[0]
         return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
 
-    def _drawn_block(self, block: int, trained: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-        """A block of corrective frames; it is drawn anew when further episodes have been trained on."""
-        key = (int(self.draws.seed), block, trained.tobytes(), device)
-        if self._block is None or self._block[0] != key:
-            self._block = key, self._draw_block(block, trained, device)
-        return self._block[1]
+    def _from_blocks(self, first: int, last: int, device: torch.device) -> list[dict[str, Tensor]]:
+        """Frames `first` to `last` - 1 of all episodes; their block is kept for the next steps."""
+        parts: list[dict[str, Tensor]] = []
+        while first < last:
+            block, place = divmod(first, BLOCK)
+            key = (int(self.draws.seed), block, device)
+            if self._block is None or self._block[0] != key:
+                everything = np.arange(len(self._episodes))
+                self._block = key, self._draw_frames(block * BLOCK, BLOCK, everything, device)
+            stop = min(place + last - first, BLOCK)
+            parts.append({name: value[place:stop] for name, value in self._block[1].items()})
+            first += stop - place
+        return parts
 
-    def _draw_block(self, block: int, trained: np.ndarray, device: torch.device) -> dict[str, Tensor]:
+    def _draw_frames(
+        self, first: int, count: int, candidates: np.ndarray, device: torch.device
+    ) -> dict[str, Tensor]:
+        """`count` frames, of (M,) places in the list of the episodes that are trained on."""
         assert self.labels is not None
-        per_frame = self.labels.draws_per_frame
-        candidates = np.flatnonzero(trained[self._episodes])
         if len(candidates) == 0:
             raise ValueError(
                 "none of the episodes in training is among those that --dataset.episodes and "
                 "--dataset.eval_split leave to train on"
             )
-        uniforms = self.draws.uniforms_at(block * BLOCK, BLOCK, per_frame).reshape(BLOCK, per_frame)
+        per_frame = self.labels.draws_per_frame
+        uniforms = self.draws.uniforms_at(first, count, per_frame).reshape(count, per_frame)
         frames = self.labels.draw(uniforms, candidates)
         raw = {**frames.observations, ACTION: frames.actions}
         episodes = self._episodes[frames.episodes]
         content = {key: self._units[key].normalize(value) for key, value in raw.items()}
-        weights = np.ones(BLOCK, np.float32) if self._weights is None else self._weights[episodes]
+        weights = np.ones(count, np.float32) if self._weights is None else self._weights[episodes]
         content |= {"weight": weights, "style_episode": episodes}
         return self.encode({key: torch.from_numpy(value).to(device) for key, value in content.items()})
 
