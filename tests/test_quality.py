@@ -55,15 +55,16 @@ def test_behaviour_cloning_shows_one_side_at_most(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("policy_type", "rate"), [("ddpm_gpt", "2e-3"), ("beso", "2e-3"), ("ddpm_act", "1e-3")]
+    ("policy_type", "rate", "steps"),
+    [("ddpm_gpt", "2e-3", 15_000), ("beso", "2e-3", 12_000), ("ddpm_act", "1e-3", 12_000)],
 )
-def test_diffusion_policies_show_both_sides(run_command, tmp_path, policy_type, rate):
-    """Without styles, by the draw of their noise alone; five minutes of training each."""
+def test_diffusion_policies_show_both_sides(run_command, tmp_path, policy_type, rate, steps):
+    """Without styles, by the draw of their noise alone; seven minutes of training each."""
     root, output_dir = tmp_path / "data", tmp_path / "run"
     write_dataset(get_recipe("medium_maze-one_side"), root, seed=0)
     network = ("--policy.attention_dropout=0", "--policy.residual_dropout=0", "--policy.lr_schedule=cosine")
-    sizes = ("--batch_size=64", "--save_freq=6000", "--seeds=1000", f"--policy.optimizer_lr={rate}")
-    run_command(train_command.main, *train_flags(policy_type, root, output_dir, 6000, *network, *sizes))
+    sizes = ("--batch_size=64", f"--save_freq={steps}", "--seeds=1000", f"--policy.optimizer_lr={rate}")
+    run_command(train_command.main, *train_flags(policy_type, root, output_dir, steps, *network, *sizes))
     policy = output_dir / "seed_1000" / "checkpoints" / "last" / "pretrained_model"
     run_command(
         eval_command.main,
