@@ -196,24 +196,29 @@ def slow_cost(paths: DemonstratedPaths, trajectories: Trajectories, row: int, ep
 
 
 def test_partners_are_drawn_by_their_cost(maze):
-    """Frequencies beside a simulation in NumPy that draws candidates and weighs them by exp(-c / h)."""
+    """Frequencies beside a simulation that draws candidates, and none with the weight of a cost of 0."""
     short = [(maze.episode(i)[STATE][:4], maze.episode(i)[ACTION][:4]) for i in (0, 1, 2)]
     short = [(states + 0.3 * i, actions) for i, (states, actions) in enumerate(short)]
     small = make_trajectories(short)
     paths = DemonstratedPaths(small.columns[STATE], small.lengths)
     draws, bandwidth = 20_000, 0.2
     uniforms = np.random.default_rng(0).random((draws, 2 * CANDIDATES + 1))
-    rows, matched = paths.draw_partners(np.zeros(draws, dtype=int), np.arange(3), bandwidth, uniforms)
+    own = np.zeros(draws, dtype=int)
+    rows, matched, is_near = paths.draw_partners(own, np.arange(3), bandwidth, uniforms)
     others = np.arange(4, 12)
     costs = np.array([slow_cost(paths, small, row, 0) for row in others])
     rng = np.random.default_rng(1)
     candidates = rng.integers(len(others), size=(draws, CANDIDATES))
-    weights = np.exp(-costs[candidates] / bandwidth)
+    candidates = np.concatenate([candidates, np.full((draws, 1), -1)], axis=1)  # -1: none
+    weights = np.exp(-np.append(costs, 0.0)[candidates] / bandwidth)
     place = (weights.cumsum(axis=1) < rng.random((draws, 1)) * weights.sum(axis=1, keepdims=True)).sum(axis=1)
-    expected = np.bincount(others[candidates[np.arange(draws), place]], minlength=12) / draws
-    found = np.bincount(rows, minlength=12) / draws
+    chosen = candidates[np.arange(draws), place]
+    expected = np.bincount(others[chosen[chosen >= 0]], minlength=12) / draws
+    found = np.bincount(rows[is_near], minlength=12) / draws
     assert found[:4].sum() == 0
     np.testing.assert_allclose(found, expected, atol=5 * np.sqrt(0.25 * 2 / draws))
+    assert is_near.mean() == pytest.approx((chosen >= 0).mean(), abs=0.02)
+    assert 0.05 < is_near.mean() < 0.95
     assert ((matched >= 0) & (matched < 4)).all()
 
 
@@ -223,7 +228,7 @@ def test_only_candidates_become_partners(maze):
     candidates = np.array([1, 4, 9, 20])
     own = candidates[np.arange(400) % 4]
     uniforms = np.random.default_rng(0).random((400, 2 * CANDIDATES + 1))
-    rows, matched = paths.draw_partners(own, candidates, 0.1, uniforms)
+    rows, matched, _ = paths.draw_partners(own, candidates, 0.1, uniforms)
     assert set(paths.episode[rows].tolist()) == set(candidates.tolist())
     assert (paths.episode[rows] != own).all()
     np.testing.assert_array_equal(paths.episode[matched], own)
@@ -237,7 +242,7 @@ def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
     trajectories = make_trajectories(episodes)
     paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
     uniforms = np.random.default_rng(0).random((500, 2 * CANDIDATES + 1))
-    rows, matched = paths.draw_partners(np.zeros(500, dtype=int), np.arange(6), 0.1, uniforms)
+    rows, matched, _ = paths.draw_partners(np.zeros(500, dtype=int), np.arange(6), 0.1, uniforms)
     away_from_the_turn = np.abs(paths.phase[rows] - 0.5) > 0.3
     assert away_from_the_turn.sum() > 100
     same_way = (paths.phase[rows] > 0.5) == (paths.phase[matched] > 0.5)
@@ -324,12 +329,17 @@ def test_labels_are_the_formula_at_the_matched_frame(maze, kind):
     limits = np.abs(maze.columns[ACTION]).max(axis=0)
     expected /= np.maximum(np.abs(expected / limits).max(axis=1), 1)[:, None]
     np.testing.assert_allclose(found.actions, expected, atol=2e-5)
-    demonstrated = {tuple(s): i for i, s in enumerate(maze.columns[STATE])}
+    owner_of: dict[tuple, set[int]] = {}  # several of a shared start
+    for state, episode in zip(maze.columns[STATE], labels.feedback.paths.episode, strict=True):
+        owner_of.setdefault(tuple(state), set()).add(int(episode))
+    owners = [owner_of.get(tuple(s), set()) for s in states]
     if kind == "demos":
-        owners = np.searchsorted(maze.starts, [demonstrated[tuple(s)] for s in states], side="right") - 1
-        assert (owners != found.episodes).all()
+        borrowed = np.array([bool(some) for some in owners])
+        np.testing.assert_array_equal(found.borrowed, borrowed)
+        assert 0.8 < borrowed.mean() < 1  # the others are noise
+        assert all(some != {j} for some, j in zip(owners, found.episodes.tolist(), strict=True) if some)
     else:
-        assert not any(tuple(s) in demonstrated for s in states)
+        assert not any(owners)
 
 
 def test_every_frame_of_the_candidates_is_drawn_alike(maze):
@@ -373,13 +383,19 @@ def test_noise_leads_as_far_whatever_the_number_of_dimensions(maze):
     assert means[1] == pytest.approx(means[0], rel=0.05)
 
 
-def test_without_partners_frames_stay_as_they_are(maze):
-    """A single candidate: demos gives its own frames with the demonstrated actions."""
-    labels = CorrectiveLabels(maze, fit_inverse_model(maze), "demos", 0.1, [STATE])
-    found = labels.draw(np.random.default_rng(0).random((20, labels.draws_per_frame)), np.array([3]))
-    own = {tuple(s): tuple(a) for s, a in zip(*(maze.episode(3)[k] for k in (STATE, ACTION)), strict=True)}
-    for state, action in zip(found.observations[STATE], found.actions, strict=True):
-        np.testing.assert_allclose(action, own[tuple(state)], rtol=1e-6)
+@pytest.mark.parametrize("apart", [0.0, 100.0])
+def test_where_no_other_demonstration_is_near_demos_draws_noise(maze, apart):
+    """A single candidate, or others far away: the very frames that `noise` draws from the same numbers."""
+    episodes = [(maze.episode(i)[STATE] + i * apart, maze.episode(i)[ACTION]) for i in range(6)]
+    trajectories = make_trajectories(episodes)
+    candidates = np.arange(6) if apart else np.array([3])
+    model = fit_inverse_model(maze)
+    noise, demos = (CorrectiveLabels(trajectories, model, k, 0.01, [STATE]) for k in ("noise", "demos"))
+    uniforms = np.random.default_rng(0).random((200, demos.draws_per_frame))
+    found = demos.draw(uniforms, candidates)
+    expected = noise.draw(uniforms[:, : noise.draws_per_frame], candidates)
+    np.testing.assert_array_equal(found.observations[STATE], expected.observations[STATE])
+    np.testing.assert_array_equal(found.actions, expected.actions)
 
 
 def test_a_gain_of_zero_repeats_the_demonstrated_action(maze):

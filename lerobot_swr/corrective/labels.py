@@ -26,11 +26,13 @@ class CorrectiveFrames:
         observations: Feature name to (P, d_k), raw: the state beside the path, and everything else as it was
             at the matched frame.
         actions: (P, A), raw.
+        borrowed: (P,) bool, whether the state is another demonstration's.
     """
 
     episodes: np.ndarray
     observations: dict[str, np.ndarray]
     actions: np.ndarray
+    borrowed: np.ndarray
 
 
 class CorrectiveLabels:
@@ -38,9 +40,10 @@ class CorrectiveLabels:
 
     ``noise`` takes the state of a frame with Gaussian noise, whose standard deviation is log-uniform between
     a tenth of `scale` and `scale`; ``demos`` a state of another demonstration, near ones more often: c, the
-    distance of its future, has the weight exp(−c / scale). Only ``observation.state`` differs from a
-    demonstrated frame: it is what actions move. Where more than two of its dimensions change, d, `scale` is
-    multiplied by √(2 / d): noise then leads as far from the path whatever d is.
+    distance of its future, has the weight exp(−c / scale), and none of them, but noise, has the weight 1.
+    Only ``observation.state`` differs from a demonstrated frame: it is what actions move. Where more than two
+    of its dimensions change, d, `scale` is multiplied by √(2 / d): noise then leads as far from the path
+    whatever d is.
 
     A pure function of uniform numbers that the caller draws. NumPy, and many frames at once: for so few
     numbers most of the time is the overhead of each operation.
@@ -70,9 +73,8 @@ class CorrectiveLabels:
     @property
     def draws_per_frame(self) -> int:
         """How many uniform numbers one frame takes."""
-        if self.kind == "noise":
-            return 2 + self.feedback.paths.states.shape[1]
-        return 2 + 2 * CANDIDATES
+        partners = 2 * CANDIDATES + 1 if self.kind == "demos" else 0
+        return 2 + self.feedback.paths.states.shape[1] + partners
 
     def draw(self, uniforms: np.ndarray, candidates: np.ndarray) -> CorrectiveFrames:
         """Draw frames of all candidates, every frame alike, and move beside them.
@@ -80,7 +82,7 @@ class CorrectiveLabels:
         Args:
             uniforms: (P, `draws_per_frame`) independent, uniform in [0, 1).
             candidates: (M,) sorted episodes whose frames may be used. With a single one there are no
-                partners: ``demos`` then gives its own frames.
+                partners: ``demos`` is then ``noise``.
         """
         paths = self.feedback.paths
         ends = paths.lengths[candidates].cumsum()
@@ -88,24 +90,23 @@ class CorrectiveLabels:
         place = np.searchsorted(ends, count, side="right")
         episodes = candidates[place]
         rows = paths.starts[episodes] + count - (ends[place] - paths.lengths[episodes])
-        states, matched = self._beside(rows, episodes, uniforms[:, 1:], candidates)
+        states, matched, borrowed = self._beside(rows, episodes, uniforms[:, 1:], candidates)
         observations = {key: column[matched] for key, column in self._others.items()}
-        return CorrectiveFrames(
-            episodes, {OBS_STATE: states, **observations}, self.feedback.act(states, matched)
-        )
+        actions = self.feedback.act(states, matched)
+        return CorrectiveFrames(episodes, {OBS_STATE: states, **observations}, actions, borrowed)
 
     def _beside(
         self, rows: np.ndarray, episodes: np.ndarray, uniforms: np.ndarray, candidates: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """States (P, d) beside the paths of frames, and the (P,) rows that they are matched with."""
-        paths = self.feedback.paths
-        if self.kind == "noise":
-            scale = self.scale * SMALLEST_NOISE ** uniforms[:, :1]
-            normal = ndtri(np.clip(uniforms[:, 1:], 1e-9, 1 - 1e-9))
-            states = (paths.states[rows] + scale * normal * paths.range).astype(np.float32)
-            return states, paths.nearest(states, rows)
-        if len(candidates) < 2:
-            return paths.states[rows], rows
-        partners, around = paths.draw_partners(episodes, candidates, self.scale, uniforms)
-        states = paths.states[partners]
-        return states, paths.nearest(states, around)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(P, d) states beside the paths of frames, (P,) rows they match, (P,) whether others lent them."""
+        paths, d = self.feedback.paths, self.feedback.paths.states.shape[1]
+        scale = self.scale * SMALLEST_NOISE ** uniforms[:, :1]
+        normal = ndtri(np.clip(uniforms[:, 1 : 1 + d], 1e-9, 1 - 1e-9))
+        states = (paths.states[rows] + scale * normal * paths.range).astype(np.float32)
+        borrowed = np.zeros(len(rows), dtype=bool)
+        if self.kind == "demos" and len(candidates) > 1:
+            numbers = uniforms[:, 1 + d :]
+            partners, around, borrowed = paths.draw_partners(episodes, candidates, self.scale, numbers)
+            states = np.where(borrowed[:, None], paths.states[partners], states)
+            rows = np.where(borrowed, around, rows)
+        return states, paths.nearest(states, rows), borrowed

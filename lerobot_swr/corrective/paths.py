@@ -79,12 +79,13 @@ class DemonstratedPaths:
 
     def draw_partners(
         self, episodes: np.ndarray, candidates: np.ndarray, bandwidth: float, uniforms: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Draw frames of other demonstrations that lie near given ones.
 
         `CANDIDATES` frames are drawn uniformly over the other episodes, and one of them by its share in
         exp(−c / bandwidth), where c is the mean distance of its next frames to the demonstration. For many
-        candidates that is a draw from all frames; the work per frame does not grow with the dataset.
+        candidates that is a draw from all frames; the work per frame does not grow with the dataset. None is
+        drawn with the weight 1, that of a frame at no distance: where all others are far, almost always.
 
         Args:
             episodes: (B,) demonstrations j, all of them candidates.
@@ -93,7 +94,8 @@ class DemonstratedPaths:
             uniforms: (B, 2 `CANDIDATES` + 1) uniform in [0, 1).
 
         Returns:
-            (B,) rows of the partner frames, and (B,) rows of demonstration j near them.
+            (B,) rows of the partner frames, (B,) rows of demonstration j near them, and (B,) False where no
+            partner was drawn.
         """
         place = (uniforms[:, :CANDIDATES] * (len(candidates) - 1)).astype(np.int64)
         place += place >= np.searchsorted(candidates, episodes)[:, None]  # skips the frame's own episode
@@ -102,10 +104,10 @@ class DemonstratedPaths:
         rows = self.starts[partners] + progress.astype(np.int64)
         grid = self._grid[episodes]  # (B, GRID)
         cost = self._costs(rows, partners, grid)
-        cumulative = np.exp((cost.min(axis=1, keepdims=True) - cost) / bandwidth).cumsum(axis=1)
-        chosen = (cumulative <= uniforms[:, -1:] * cumulative[:, -1:]).sum(axis=1)
+        cumulative = np.exp(-cost / bandwidth).cumsum(axis=1)
+        chosen = (cumulative <= uniforms[:, -1:] * (cumulative[:, -1:] + 1)).sum(axis=1)
         partner = rows[np.arange(len(rows)), np.minimum(chosen, CANDIDATES - 1)]
-        return partner, self._expected(partner, grid)
+        return partner, self._expected(partner, grid), chosen < CANDIDATES
 
     def _costs(self, rows: np.ndarray, episodes: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """(B, C) mean distance of the next frames of rows (B, C) to the nearest of (B, GRID) rows."""

@@ -74,7 +74,8 @@ class ZBCConfig(BCConfig):
 
     # --- Corrective labels: beyond the paper, see docs/contracting.md ---
     # Teach every style the way back to its demonstration, from states beside it: "none" (the paper), "noise"
-    # (its own states with noise; for states of few dimensions) or "demos" (states of other demonstrations).
+    # (its own states with noise; for states of few dimensions) or "demos" (states of other demonstrations,
+    # and noise where none is near).
     corrective: str = "none"
     # How far beside: the largest noise, or the distance at which other demonstrations' states become rare, as
     # a share of each state dimension's range, in a state of two dimensions; √(2 / d) times that in one of d,

@@ -162,6 +162,8 @@ class Corrections(nn.Module):
                 scale,
                 config.observation_keys,
             )
+            if kind == "demos":
+                _log_borrowed(self.labels, len(dynamics.episodes))
             self._episodes = dynamics.episodes
             self._weights = None if weights is None else weights.cpu().numpy()
 
@@ -281,6 +283,17 @@ class Corrections(nn.Module):
             return {}
         corrective = drawn["corrective"].cpu().numpy()
         return {"corrective_loss": float(losses.cpu().numpy() @ corrective) / (0.5 * len(corrective))}
+
+
+def _log_borrowed(labels: CorrectiveLabels, n_episodes: int) -> None:
+    """Say how many states ``demos`` finds near in other demonstrations."""
+    numbers = np.random.default_rng(0).random((BLOCK, labels.draws_per_frame))
+    share = labels.draw(numbers, np.arange(n_episodes)).borrowed.mean()
+    logger.info(
+        "corrective=demos: about %.0f %% of the corrective states are other demonstrations'; where none is "
+        "near, noise as of corrective=noise",
+        100 * share,
+    )
 
 
 def _units_of(preprocessor: Any, columns: dict[str, np.ndarray]) -> dict[str, Units]:
