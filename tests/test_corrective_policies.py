@@ -115,11 +115,9 @@ def test_half_of_the_frames_are_corrective(small_maze, policy_type, kind):
         assert torch.equal(drawn[key][~corrective], value[~corrective]), key
         assert drawn[key].dtype == value.dtype, key  # float32: not every device has float64
     styles = drawn["style_episode"][corrective]
-    torch.testing.assert_close(drawn["weight"][corrective], policy.frame_weights(styles))
     assert set(styles.tolist()) == set(range(6))
-    if policy_type == "wzbc":
-        assert not drawn["relabelled"][corrective].any()
-        assert drawn["relabelled"].any()
+    if policy_type == "zbc":
+        torch.testing.assert_close(drawn["weight"][corrective], policy.frame_weights(styles))
     assert ((drawn[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
 
 
@@ -137,6 +135,33 @@ def test_corrective_frames_teach_the_style_of_their_demonstration(small_maze):
         torch.testing.assert_close(
             drawn[ACTION][place], demonstrated[ACTION][own][distances.argmin()], atol=1e-3, rtol=0
         )
+
+
+def test_wzbc_relabels_corrective_frames_as_it_does_demonstrated_ones(small_maze):
+    """Weight W(i, j) of demonstration i beside which a frame lies; no gradient reaches another's style."""
+    policy, meta = make(
+        small_maze, "wzbc", corrective="noise", corrective_scale=1e-7, p=0.5, partner_sampling="uniform"
+    )
+    drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
+    corrective, relabelled = drawn["corrective"], drawn["corrective"] & drawn["relabelled"]
+    assert float(relabelled.sum() / corrective.sum()) == pytest.approx(0.5, abs=0.1)
+    distances = policy.distances()
+    nu = distances / distances.max(axis=1, keepdims=True)
+    everything = batch_of(policy, meta, every_frame(policy).sort().values)
+    for place in corrective.nonzero().squeeze(1).tolist():
+        apart = (everything[STATE] - drawn[STATE][place]).norm(dim=1)
+        owners = set(everything["episode_index"][apart < 1e-4].tolist())  # several at a shared start
+        style = int(drawn["style_episode"][place])
+        similarity = {i: np.exp(-policy.config.beta * nu[i, style]) if i != style else 1.0 for i in owners}
+        weights = [w * float(policy.frame_weights(torch.tensor([i]))) for i, w in similarity.items()]
+        assert np.isclose(float(drawn["weight"][place]), weights, rtol=1e-4).any()
+    losses = policy.frame_losses(drawn)
+    (gradient,) = torch.autograd.grad(
+        losses[relabelled].sum(), policy.styles.embedding.weight, retain_graph=True
+    )
+    assert not gradient.any()
+    (gradient,) = torch.autograd.grad(losses[corrective].sum(), policy.styles.embedding.weight)
+    assert gradient.any(dim=1).all()
 
 
 def test_the_larger_half_of_odd_batches_takes_turns(small_maze):
@@ -236,7 +261,7 @@ def test_figures_count_each_kind_of_frame_for_itself(small_maze):
     assert figures["corrective_loss"] == pytest.approx(float((losses * corrective).mean() / 0.5), rel=1e-5)
     own = ~corrective & ~relabelled
     assert figures["own_style_loss"] == pytest.approx(float((losses * own).mean() / 0.6 / 0.5), rel=1e-5)
-    others = float((losses * relabelled).mean() / 0.4 / 0.5)
+    others = float((losses * (relabelled & ~corrective)).mean() / 0.4 / 0.5)
     assert figures["relabelled_loss"] == pytest.approx(others, rel=1e-5)
 
 

@@ -174,7 +174,7 @@ class Corrections(nn.Module):
         time.
 
         Args:
-            drawn: What the policy's `draw` prepared for (B,) frames.
+            drawn: What the policy's `draw` prepared for (B,) frames, each with its own style.
             trained: (N,) non-zero where an episode was trained on.
             steps: Number of steps whose frames these are.
 
@@ -194,8 +194,6 @@ class Corrections(nn.Module):
         edges = (first + count // steps * np.arange(steps + 1)) // 2
         frames = self._frames(edges, trained, device)
         replaced = {key: drawn[key].index_copy(0, places, value) for key, value in frames.items()}
-        if "relabelled" in drawn:
-            replaced["relabelled"] = drawn["relabelled"] & ~corrective
         return {**drawn, **replaced, "corrective": corrective}
 
     def _half(self, count: int, steps: int, first: int, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -278,7 +276,7 @@ class Corrections(nn.Module):
         return {prefix + key: value for key, value in own.items()}
 
     def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
-        """``corrective_loss``: the mean loss of corrective frames, unbiased; read its average over time."""
+        """``corrective_loss``: corrective frames' mean weighted loss, unbiased; read its average over time."""
         if "corrective" not in drawn:
             return {}
         corrective = drawn["corrective"].cpu().numpy()

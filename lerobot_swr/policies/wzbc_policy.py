@@ -59,8 +59,8 @@ class WZBCPolicy(ZBCPolicy):
             raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
         return keys
 
-    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
-        """Draw the pair of each frame: its style may be another episode's.
+    def _relabel(self, drawn: dict[str, Tensor], steps: int) -> dict[str, Tensor]:
+        """Draw the pair of each frame, corrective ones too: its style may be another episode's.
 
         ``relabelled`` (B,) is True where it is. The mean loss has algorithm 1's expectation.
 
@@ -70,6 +70,7 @@ class WZBCPolicy(ZBCPolicy):
         if self.sampler is None:
             raise RuntimeError("wzbc compares demonstrations to train: create the policy with dataset_meta")
         self.sampler.set_candidates(self.styles.trained[: self.config.num_episodes])
+        episodes = drawn["style_episode"]
         pairs = self.sampler.draw(episodes, self.draws.uniforms(steps, len(episodes) // steps))
         weight = drawn["weight"] * pairs.weights
         return {**drawn, "weight": weight, "style_episode": pairs.styles, "relabelled": pairs.relabelled}
@@ -99,7 +100,8 @@ class WZBCPolicy(ZBCPolicy):
         relabelled = drawn["relabelled"].cpu().numpy()
         own, share = ~relabelled, float(len(values))
         if "corrective" in drawn:
-            own, share = own & ~drawn["corrective"].cpu().numpy(), share / 2
+            demonstrated = ~drawn["corrective"].cpu().numpy()
+            own, relabelled, share = own & demonstrated, relabelled & demonstrated, share / 2
         if p < 1:
             figures["own_style_loss"] = float(values @ own) / share / (1 - p)
         if p > 0:

@@ -93,14 +93,14 @@ class ZBCPolicy(BCPolicy):
             parts = [self.draw(one) for one in split]
             return {key: torch.cat([part[key] for part in parts]) for key in parts[0]}
         self.styles.mark_trained(episodes)
-        drawn = self._with_styles(super().draw(batch, steps), episodes, steps)
-        if self.corrections is None:
-            return drawn
-        return self.corrections.correct(drawn, self.styles.trained[: self.config.num_episodes], steps)
+        drawn = {**super().draw(batch, steps), "style_episode": episodes}
+        if self.corrections is not None:
+            drawn = self.corrections.correct(drawn, self.styles.trained[: self.config.num_episodes], steps)
+        return self._relabel(drawn, steps)
 
-    def _with_styles(self, drawn: dict[str, Tensor], episodes: Tensor, steps: int) -> dict[str, Tensor]:
-        """What `draw` returns, given what `BCPolicy.draw` did: every frame teaches its own style."""
-        return {**drawn, "style_episode": episodes}
+    def _relabel(self, drawn: dict[str, Tensor], steps: int) -> dict[str, Tensor]:
+        """What `draw` returns, given frames with the styles of their own episodes: these stay."""
+        return drawn
 
     def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B,) weighted squared error of each frame under its style; a pure function, see `BCPolicy`."""
