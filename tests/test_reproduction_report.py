@@ -122,7 +122,8 @@ def test_contracting_tables_have_a_row_per_condition_and_a_column_per_method(dra
     """Success, style match and length error; invented rollouts are 3 steps shorter than their frames."""
     suite = load_suites(drawn)["contracting"]
     *rates, length_errors = contracting_tables.by_condition(suite, "small_maze")
-    methods = ["zbc", "wzbc", "zbc corrective=noise", "zbc corrective=demos", "playback"]
+    corrective = ["zbc corrective=noise", "zbc corrective=demos", "wzbc corrective=noise"]
+    methods = ["zbc", "wzbc", *corrective, "playback"]
     for table in (*rates, length_errors):
         heads = [" ".join(head.split()) for head in table.header]
         assert heads == ["condition seeds × n", *(f"{method} 2 × 12" for method in methods)]

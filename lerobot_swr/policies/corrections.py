@@ -276,7 +276,7 @@ class Corrections(nn.Module):
         return {prefix + key: value for key, value in own.items()}
 
     def figures(self, drawn: dict[str, Tensor], losses: Tensor) -> dict[str, float]:
-        """``corrective_loss``: corrective frames' mean weighted loss, unbiased; read its average over time."""
+        """``corrective_loss``: corrective frames' mean weighted loss, unbiased: read its average."""
         if "corrective" not in drawn:
             return {}
         corrective = drawn["corrective"].cpu().numpy()

@@ -60,7 +60,8 @@ STICKY_WALLS: dict[str, dict[str, Any]] = {
     "sticky walls": {"sticky_walls": True},
     "sticky walls, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
 }
-CORRECTIVE = ("noise", "demos")
+# Not wzbc with demos: other demonstrations teach its styles as it is.
+CORRECTIVE = (("zbc", "noise"), ("zbc", "demos"), ("wzbc", "noise"))
 
 # --- Control ---
 LENGTH_BAND = (70, 80)
@@ -139,8 +140,9 @@ def _contracting(settings: ReproductionSettings, demos: Demonstrations) -> Itera
     if not chosen:
         return
     trained = [training(settings, demos, policy) for policy in chosen]
-    if "zbc" in chosen:
-        trained += [training(settings, demos, "zbc", {"corrective": kind}) for kind in CORRECTIVE]
+    for policy, kind in CORRECTIVE:
+        if policy in chosen:
+            trained.append(training(settings, demos, policy, {"corrective": kind}))
     for one in dict.fromkeys(trained):
         for name, (env, protocols) in perturbations(demos).items():
             yield evaluation(settings, demos, one, name, env, protocols)
