@@ -1,0 +1,137 @@
+"""The options of ``lerobot-swr-eval``, checked before anything is loaded."""
+
+import datetime as dt
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig
+
+from lerobot_swr.cli.eval_conflicts import refuse_conflicts
+from lerobot_swr.evaluation.checkpoint import DatasetSource
+from lerobot_swr.styles import check_style_sampling
+
+
+@dataclass
+class EvalCommand:
+    """Options of ``lerobot-swr-eval``."""
+
+    # The demonstrations to compare with (the training dataset, for a style policy).
+    dataset: DatasetSource = field(default_factory=DatasetSource)
+    # Environment for rollouts; leave it out to evaluate on the dataset's frames.
+    env: EnvConfig | None = None
+    # Give the checkpoint as --policy.path=FOLDER; other --policy.* flags override its configuration.
+    policy: PreTrainedConfig | None = None
+    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback.
+    baseline: str | None = None
+    # Number of rollouts.
+    n_episodes: int = 100
+    # Largest number of environments that run at once.
+    batch_size: int = 100
+    # How styles are drawn: uniform (the paper), stratified (each style once before any again) or fixed; null
+    # keeps the checkpoint's setting.
+    style_sampling: str | None = None
+    # Request every demonstrated behaviour from this many starts, the same for all, instead of n_episodes
+    # rollouts: confusion matrix, control accuracy, distance to the requested demonstrations. 0 does not.
+    counterfactual: int = 0
+    # Blend this many pairs of styles of the same behaviour, and of different ones, instead. 0 does not.
+    blend: int = 0
+    # Roll out n_episodes times under every perturbation of the environment instead: success, style match and
+    # length error, with each style equally often.
+    robustness: bool = False
+    # [shortest, longest] in frames: compare the rollouts' lengths with the demonstrations' in this band.
+    length_band: list[int] | None = None
+    # Labels episodes: module:function; null takes the environment's own rule.
+    behavior_rule: str | None = None
+    # Seeds the drawing of styles and the environments.
+    seed: int = 1000
+    # Where results are written; null makes a folder under outputs/swr_eval.
+    output_dir: Path | None = None
+    # Rename observations of the environment to the policy's names.
+    rename_map: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Load the checkpoint's configuration and check the values.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        if self.style_sampling is not None:
+            check_style_sampling(self.style_sampling)
+        self._refuse_conflicts()
+        self._find_policy()
+        if self.length_band is not None and len(self.length_band) != 2:
+            raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
+        for key in ("counterfactual", "blend"):
+            if getattr(self, key) < 0:
+                raise ValueError(f"{key}={getattr(self, key)}: expected a number >= 0")
+        for key in ("n_episodes", "batch_size"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+        if self.output_dir is None:
+            self.output_dir = Path("outputs/swr_eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}"
+
+    def _refuse_conflicts(self) -> None:
+        """Refuse flags of which one would have no effect beside another."""
+        given = {
+            "robustness": self.robustness,
+            "counterfactual": self.counterfactual > 0,
+            "blend": self.blend > 0,
+            "length_band": self.length_band is not None,
+            "style_sampling": self.style_sampling is not None,
+            "behavior_rule": self.behavior_rule is not None,
+            "n_episodes": self._is_given("n_episodes"),
+            "batch_size": self._is_given("batch_size"),
+            "dataset.episodes": self.dataset.episodes is not None,
+            "rename_map": bool(self.rename_map),
+            "baseline": self.baseline is not None,
+            "policy.style_sampling": any(o.startswith("--style_sampling") for o in _policy_overrides()),
+            "policy.*": self.policy is not None or bool(_policy_overrides()),
+        }
+        refuse_conflicts([key for key, is_given in given.items() if is_given], self.env is not None)
+
+    def _is_given(self, key: str) -> bool:
+        """Whether an option is on the command line, or a --config_path file sets it to another value."""
+        return parser.parse_arg(key) is not None or getattr(self, key) != getattr(EvalCommand, key)
+
+    def _find_policy(self) -> None:
+        path = parser.get_path_arg("policy")
+        if self.baseline is not None:
+            if self.baseline != "playback":
+                raise ValueError(f"baseline={self.baseline!r}: expected 'playback'")
+            if path:
+                raise ValueError(
+                    f"baseline={self.baseline!r} takes the place of a policy: leave out --policy.path"
+                )
+            if self.env is None or self.blend:
+                raise ValueError(
+                    f"baseline={self.baseline!r} has no styles to blend and acts in an environment: give "
+                    "--env.type=... and leave out --blend"
+                )
+            if self.robustness:
+                self.style_sampling = self.style_sampling or "stratified"
+            return
+        if not path:
+            raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
+        if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
+            raise ValueError(
+                f"policy.path={path!r}: no config.json in this folder; "
+                "give a checkpoint's pretrained_model folder"
+            )
+        overrides = _policy_overrides()
+        if self.robustness and not any(option.startswith("--style_sampling") for option in overrides):
+            self.style_sampling = self.style_sampling or "stratified"
+        self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        self.policy.pretrained_path = Path(path)
+        if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
+            self.policy.style_sampling = self.style_sampling
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Keys that LeRobot's parser loads from a folder."""
+        return ["policy"]
+
+
+def _policy_overrides() -> list[str]:
+    """The ``--policy.*`` options that are given beside the checkpoint."""
+    return parser.get_yaml_overrides("policy") + (parser.get_cli_overrides("policy") or [])
