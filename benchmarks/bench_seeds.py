@@ -4,6 +4,9 @@ The paper's five seeds, and ten: the more seeds a process trains, the less a see
 
 One run after the other, each on all cores of the machine as its defaults have it; the rate of
 `lerobot-swr-train` is that between two checkpoints, which leaves out start-up, as LeRobot's own figures do.
+
+Then what a step cannot do without, each alone, of five stacked seeds on one thread: the matrix products
+forward and backward, and Adam.
 """
 
 import argparse
@@ -15,10 +18,17 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+import torch
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import make_policy
+from lerobot.policies.factory import make_policy_config
+from torch.utils.benchmark import Timer
+
 from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 
 COUNTS_OF_SEEDS = (5, 10)
+BATCH_SIZE = 16
 
 
 def main() -> None:
@@ -40,12 +50,46 @@ def main() -> None:
                 f"{many / one_thread:.1f} times that of one thread",
                 flush=True,
             )
+        seconds = necessities(root)
+        each = ", ".join(
+            f"{name} {1e6 * value / COUNTS_OF_SEEDS[0]:.0f} µs" for name, value in seconds.items()
+        )
+        print(f"a seed's step on one thread: {each}")
+
+
+def necessities(root: Path) -> dict[str, float]:
+    """Seconds of one step of `COUNTS_OF_SEEDS[0]` stacked seeds on one thread, by what takes them."""
+    config = make_policy_config("wzbc", device="cpu", push_to_hub=False)
+    policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/only_forward", root=root))
+    seeds = COUNTS_OF_SEEDS[0]
+    layers = []  # inputs (seeds, batch, in), weights (seeds, in, out), gradients of outputs
+    for weight in policy.network.parameters():
+        if weight.dim() == 2:
+            out, size = weight.shape
+            shapes = ((seeds, BATCH_SIZE, size), (seeds, size, out), (seeds, BATCH_SIZE, out))
+            layers.append(tuple(torch.randn(shape) for shape in shapes))
+    blocks = [torch.nn.Parameter(torch.randn(seeds, p.numel())) for p in policy.parameters()]
+    for block in blocks:
+        block.grad = torch.randn_like(block)
+    adam = torch.optim.Adam(blocks, lr=1e-6, fused=True)
+
+    def multiply() -> None:
+        for inputs, weights, gradients in layers:
+            torch.bmm(inputs, weights)
+            torch.bmm(gradients, weights.transpose(1, 2))
+            torch.bmm(inputs.transpose(1, 2), gradients)
+
+    statements = {"matrix products": multiply, "Adam": adam.step}
+    return {
+        name: Timer("f()", globals={"f": f}, num_threads=1).blocked_autorange(min_run_time=2).median / seeds
+        for name, f in statements.items()
+    }
 
 
 def flags(root: Path, output_dir: Path, steps: int) -> list[str]:
     return [
         *("--policy.type=wzbc", "--policy.device=cpu", "--policy.push_to_hub=false"),
-        *("--dataset.repo_id=local/only_forward", f"--dataset.root={root}", "--batch_size=16"),
+        *("--dataset.repo_id=local/only_forward", f"--dataset.root={root}", f"--batch_size={BATCH_SIZE}"),
         *("--num_workers=0", f"--steps={steps}", f"--output_dir={output_dir}"),
     ]
 
