@@ -5,8 +5,8 @@ The paper's five seeds, and ten: the more seeds a process trains, the less a see
 One run after the other, each on all cores of the machine as its defaults have it; the rate of
 `lerobot-swr-train` is that between two checkpoints, which leaves out start-up, as LeRobot's own figures do.
 
-Then what a step cannot do without, each alone, of five stacked seeds on one thread: the matrix products
-forward and backward, and Adam.
+Then the largest parts of a step, each alone, of five stacked seeds on one thread: the matrix products forward
+and backward, and Adam.
 """
 
 import argparse
@@ -50,15 +50,12 @@ def main() -> None:
                 f"{many / one_thread:.1f} times that of one thread",
                 flush=True,
             )
-        seconds = necessities(root)
-        each = ", ".join(
-            f"{name} {1e6 * value / COUNTS_OF_SEEDS[0]:.0f} µs" for name, value in seconds.items()
-        )
+        each = ", ".join(f"{name} {1e6 * seconds:.0f} µs" for name, seconds in largest_parts(root).items())
         print(f"a seed's step on one thread: {each}")
 
 
-def necessities(root: Path) -> dict[str, float]:
-    """Seconds of one step of `COUNTS_OF_SEEDS[0]` stacked seeds on one thread, by what takes them."""
+def largest_parts(root: Path) -> dict[str, float]:
+    """Seconds of a seed's step, where `COUNTS_OF_SEEDS[0]` are stacked on one thread, by what takes them."""
     config = make_policy_config("wzbc", device="cpu", push_to_hub=False)
     policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/only_forward", root=root))
     seeds = COUNTS_OF_SEEDS[0]

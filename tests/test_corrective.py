@@ -7,7 +7,7 @@ import torch
 from lerobot_swr.corrective.feedback import Feedback
 from lerobot_swr.corrective.inverse_model import InverseModel, fit_inverse_model
 from lerobot_swr.corrective.labels import CorrectiveLabels
-from lerobot_swr.corrective.paths import CANDIDATES, DemonstratedPaths
+from lerobot_swr.corrective.paths import CANDIDATES, PHASE_WINDOW, DemonstratedPaths
 from lerobot_swr.corrective.relative_actions import RelativeActions, Units, target_dimensions
 from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP
@@ -203,12 +203,13 @@ def test_partners_are_drawn_by_their_cost(maze):
     paths = DemonstratedPaths(small.columns[STATE], small.lengths)
     draws, bandwidth = 20_000, 0.2
     uniforms = np.random.default_rng(0).random((draws, 2 * CANDIDATES + 1))
-    own = np.zeros(draws, dtype=int)
-    rows, matched, is_near = paths.draw_partners(own, np.arange(3), bandwidth, uniforms)
+    second = np.ones(draws, dtype=int)  # of four frames: a third of its episode is over
+    rows, matched, is_near = paths.draw_partners(second, np.arange(3), bandwidth, uniforms)
     others = np.arange(4, 12)
     costs = np.array([slow_cost(paths, small, row, 0) for row in others])
     rng = np.random.default_rng(1)
-    candidates = rng.integers(len(others), size=(draws, CANDIDATES))
+    progress = rng.uniform(1 / 3 - PHASE_WINDOW, 1 / 3 + PHASE_WINDOW, size=(draws, CANDIDATES))
+    candidates = 4 * rng.integers(2, size=(draws, CANDIDATES)) + (4 * progress).astype(int)
     candidates = np.concatenate([candidates, np.full((draws, 1), -1)], axis=1)  # -1: none
     weights = np.exp(-np.append(costs, 0.0)[candidates] / bandwidth)
     place = (weights.cumsum(axis=1) < rng.random((draws, 1)) * weights.sum(axis=1, keepdims=True)).sum(axis=1)
@@ -228,7 +229,7 @@ def test_only_candidates_become_partners(maze):
     candidates = np.array([1, 4, 9, 20])
     own = candidates[np.arange(400) % 4]
     uniforms = np.random.default_rng(0).random((400, 2 * CANDIDATES + 1))
-    rows, matched, _ = paths.draw_partners(own, candidates, 0.1, uniforms)
+    rows, matched, _ = paths.draw_partners(paths.starts[own] + 30, candidates, 0.1, uniforms)
     assert set(paths.episode[rows].tolist()) == set(candidates.tolist())
     assert (paths.episode[rows] != own).all()
     np.testing.assert_array_equal(paths.episode[matched], own)
@@ -242,11 +243,30 @@ def test_a_place_that_is_passed_twice_is_matched_on_the_same_way():
     trajectories = make_trajectories(episodes)
     paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
     uniforms = np.random.default_rng(0).random((500, 2 * CANDIDATES + 1))
-    rows, matched, _ = paths.draw_partners(np.zeros(500, dtype=int), np.arange(6), 0.1, uniforms)
+    rows, matched, _ = paths.draw_partners(np.arange(500) % 100, np.arange(6), 0.1, uniforms)
     away_from_the_turn = np.abs(paths.phase[rows] - 0.5) > 0.3
     assert away_from_the_turn.sum() > 100
     same_way = (paths.phase[rows] > 0.5) == (paths.phase[matched] > 0.5)
     assert same_way[away_from_the_turn].all()
+
+
+def test_partners_lend_where_demonstrations_meet_and_none_where_they_part():
+    """Ten demonstrations go together for a half and then ways of their own: each half gets what it can."""
+    together, apart = np.linspace(0, 1, 50), np.linspace(0, 1, 50)
+    episodes = []
+    for angle in np.linspace(-1.5, 1.5, 10):
+        first = np.stack([together, 0 * together], axis=1)
+        second = first[-1] + 5 * apart[:, None] * np.array([np.cos(angle), np.sin(angle)])
+        states = np.concatenate([first, second])
+        episodes.append((states, np.gradient(states, axis=0)))
+    trajectories = make_trajectories(episodes)
+    paths = DemonstratedPaths(trajectories.columns[STATE], trajectories.lengths)
+    rows = np.arange(len(paths.states))
+    uniforms = np.random.default_rng(0).random((len(rows), 2 * CANDIDATES + 1))
+    partners, _, borrowed = paths.draw_partners(rows, np.arange(10), 0.01, uniforms)
+    assert borrowed[paths.phase < 0.25].mean() > 0.8
+    assert borrowed[paths.phase > 0.85].mean() < 0.2
+    assert (np.abs(paths.phase[partners] - paths.phase[rows]) <= PHASE_WINDOW + 0.02).all()
 
 
 # --- Feedback and labels ---

@@ -39,8 +39,8 @@ class CorrectiveLabels:
     """Draws states beside demonstrations' paths, with the actions that lead back.
 
     ``noise`` takes the state of a frame with Gaussian noise, whose standard deviation is log-uniform between
-    a tenth of `scale` and `scale`; ``demos`` a state of another demonstration, near ones more often: c, the
-    distance of its future, has the weight exp(−c / scale), and none of them, but noise, has the weight 1.
+    a tenth of `scale` and `scale`; ``demos`` a state of another demonstration, one of a few drawn at random:
+    c, the distance of its future, has the weight exp(−c / scale), and none of them, but noise, the weight 1.
     Only ``observation.state`` differs from a demonstrated frame: it is what actions move. Where more than two
     of its dimensions change, d, `scale` is multiplied by √(2 / d): noise then leads as far from the path
     whatever d is.
@@ -90,13 +90,13 @@ class CorrectiveLabels:
         place = np.searchsorted(ends, count, side="right")
         episodes = candidates[place]
         rows = paths.starts[episodes] + count - (ends[place] - paths.lengths[episodes])
-        states, matched, borrowed = self._beside(rows, episodes, uniforms[:, 1:], candidates)
+        states, matched, borrowed = self._beside(rows, uniforms[:, 1:], candidates)
         observations = {key: column[matched] for key, column in self._others.items()}
         actions = self.feedback.act(states, matched)
         return CorrectiveFrames(episodes, {OBS_STATE: states, **observations}, actions, borrowed)
 
     def _beside(
-        self, rows: np.ndarray, episodes: np.ndarray, uniforms: np.ndarray, candidates: np.ndarray
+        self, rows: np.ndarray, uniforms: np.ndarray, candidates: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(P, d) states beside the paths of frames, (P,) rows they match, (P,) whether others lent them."""
         paths, d = self.feedback.paths, self.feedback.paths.states.shape[1]
@@ -106,7 +106,7 @@ class CorrectiveLabels:
         borrowed = np.zeros(len(rows), dtype=bool)
         if self.kind == "demos" and len(candidates) > 1:
             numbers = uniforms[:, 1 + d :]
-            partners, around, borrowed = paths.draw_partners(episodes, candidates, self.scale, numbers)
+            partners, around, borrowed = paths.draw_partners(rows, candidates, self.scale, numbers)
             states = np.where(borrowed[:, None], paths.states[partners], states)
             rows = np.where(borrowed, around, rows)
         return states, paths.nearest(states, rows), borrowed

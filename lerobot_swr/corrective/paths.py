@@ -78,35 +78,37 @@ class DemonstratedPaths:
     # --- Partner frames ---
 
     def draw_partners(
-        self, episodes: np.ndarray, candidates: np.ndarray, bandwidth: float, uniforms: np.ndarray
+        self, rows: np.ndarray, candidates: np.ndarray, bandwidth: float, uniforms: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Draw frames of other demonstrations that lie near given ones.
+        """Draw frames of other demonstrations that lie near those of given frames.
 
-        `CANDIDATES` frames are drawn uniformly over the other episodes, and one of them by its share in
-        exp(−c / bandwidth), where c is the mean distance of its next frames to the demonstration. For many
-        candidates that is a draw from all frames; the work per frame does not grow with the dataset. None is
-        drawn with the weight 1, that of a frame at no distance: where all others are far, almost always.
+        `CANDIDATES` frames are drawn uniformly over the other episodes, where these have progressed like the
+        given frame, within `PHASE_WINDOW`. One of them is chosen by its share in exp(−c / bandwidth), where c
+        is the mean distance of its next frames to the demonstration, or none by a share of 1, that of a frame
+        at no distance. The work per frame does not grow with the dataset.
 
         Args:
-            episodes: (B,) demonstrations j, all of them candidates.
+            rows: (B,) frames of demonstrations j, all of them candidates.
             candidates: (M,) sorted episodes that may be drawn, M >= 2.
             bandwidth: In units of distances.
             uniforms: (B, 2 `CANDIDATES` + 1) uniform in [0, 1).
 
         Returns:
             (B,) rows of the partner frames, (B,) rows of demonstration j near them, and (B,) False where no
-            partner was drawn.
+            partner was chosen.
         """
+        episodes, phase = self.episode[rows], self.phase[rows][:, None]
         place = (uniforms[:, :CANDIDATES] * (len(candidates) - 1)).astype(np.int64)
         place += place >= np.searchsorted(candidates, episodes)[:, None]  # skips the frame's own episode
         partners = candidates[place]  # (B, C)
-        progress = uniforms[:, CANDIDATES : 2 * CANDIDATES] * self.lengths[partners]
-        rows = self.starts[partners] + progress.astype(np.int64)
+        low, high = np.maximum(phase - PHASE_WINDOW, 0), np.minimum(phase + PHASE_WINDOW, 1)
+        progress = low + uniforms[:, CANDIDATES : 2 * CANDIDATES] * (high - low)
+        found = self.starts[partners] + (progress * self.lengths[partners]).astype(np.int64)
         grid = self._grid[episodes]  # (B, GRID)
-        cost = self._costs(rows, partners, grid)
+        cost = self._costs(found, partners, grid)
         cumulative = np.exp(-cost / bandwidth).cumsum(axis=1)
         chosen = (cumulative <= uniforms[:, -1:] * (cumulative[:, -1:] + 1)).sum(axis=1)
-        partner = rows[np.arange(len(rows)), np.minimum(chosen, CANDIDATES - 1)]
+        partner = found[np.arange(len(found)), np.minimum(chosen, CANDIDATES - 1)]
         return partner, self._expected(partner, grid), chosen < CANDIDATES
 
     def _costs(self, rows: np.ndarray, episodes: np.ndarray, grid: np.ndarray) -> np.ndarray:
