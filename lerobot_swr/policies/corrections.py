@@ -288,8 +288,7 @@ def _log_borrowed(labels: CorrectiveLabels, n_episodes: int) -> None:
     numbers = np.random.default_rng(0).random((BLOCK, labels.draws_per_frame))
     share = labels.draw(numbers, np.arange(n_episodes)).borrowed.mean()
     logger.info(
-        "corrective=demos: about %.0f %% of the corrective states are other demonstrations'; where none is "
-        "near, noise as of corrective=noise",
+        "corrective=demos: about %.0f %% of the corrective states are other demonstrations', the rest noise",
         100 * share,
     )
 

@@ -90,7 +90,8 @@ class WZBCPolicy(ZBCPolicy):
         ``effective_demos`` per style. The first three count every episode alike where the loss does, and are
         unbiased estimates, whichever way pairs are drawn: the loss is (1 - p) own_style_loss + p
         relabelled_loss. They are defined for every batch: read their averages over time. Corrective frames
-        count for ``corrective_loss`` alone.
+        count for ``corrective_loss`` alone, pair weights included: the loss is then half of the above plus
+        half of it.
         """
         assert self.sampler is not None
         p = self.config.p

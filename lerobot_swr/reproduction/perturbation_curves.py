@@ -13,7 +13,7 @@ from lerobot_swr.reproduction.summary import Rate, Summary
 Measure = Callable[[Summary], tuple[float, float, float] | None]
 """Value, and the ends of its interval; None where there is none."""
 
-MARKERS = "os^Dv"
+MARKERS = "os^DvP"
 _ARM = ("start_radius", "action_noise", "box_push")
 
 
@@ -59,7 +59,7 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
             else:
                 axes.set_ylim(bottom=0)
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 5), fontsize=9)
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 3), fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     return True
