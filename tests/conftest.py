@@ -18,6 +18,8 @@ import lerobot_swr  # noqa: F401  (registers policies and environments)
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 
+pytest_plugins = ["corrective_policies", "reproduction_cells", "training_command"]  # more fixtures
+
 SMALL_MAZE = {"10": 4, "20": 2}  # behaviour -> number of episodes
 OBSERVATIONS = ("observation.state", "observation.environment_state")
 WINDOW, CHUNK = 5, 4  # of the baselines

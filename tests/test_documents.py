@@ -13,10 +13,13 @@ CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_and_pictures_of_a_page_exist(page):
-    """Every relative link leads to a file of the repository."""
-    targets = re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text())
+def test_links_pictures_and_scripts_of_a_page_exist(page):
+    """Every relative link and every script to run is a file of the repository."""
+    text = page.read_text()
+    targets = re.findall(r"\]\(([^)#]+)[^)]*\)", text)
     missing = [target for target in targets if "://" not in target and not (page.parent / target).exists()]
+    scripts = re.findall(r"python ((?:docs|benchmarks)/\S+\.py)", text)
+    missing += [script for script in scripts if not (REPOSITORY / script).is_file()]
     assert not missing
 
 

@@ -1,12 +1,7 @@
 """``lerobot-swr-train``: many seeds at once, each as ``lerobot-train`` would train it."""
 
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -17,6 +12,7 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
+from training_command import swr_train_killed_at
 
 from lerobot_swr.cli import train as train_command
 from lerobot_swr.corrective.inverse_model import fit_inverse_model
@@ -47,16 +43,6 @@ def assert_same_files(one: Path, other: Path) -> None:
             assert torch.equal(value, found[key]), (name, key)
     for name in ("optimizer_param_groups.json", "scheduler_state.json", "training_step.json"):
         assert (one / "training_state" / name).read_text() == (other / "training_state" / name).read_text()
-
-
-@pytest.fixture
-def swr_train(run_command):
-    """Runs ``lerobot-swr-train`` in this process."""
-
-    def run(*flags: str) -> None:
-        run_command(train_command.main, *flags)
-
-    return run
 
 
 def test_frames_come_in_lerobots_order():
@@ -184,23 +170,7 @@ def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp
     steps = 400
     swr_train(*train_flags("wzbc", small_maze, tmp_path / "whole", steps, *flags))
     killed = train_flags("wzbc", small_maze, tmp_path / "killed", steps, *flags)
-    script = "from lerobot_swr.cli.train import main; main()"
-    process = subprocess.Popen(
-        [sys.executable, "-c", script, *killed],
-        env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    begun = tmp_path / "killed" / "seed_2" / "checkpoints" / "000040"
-    while not begun.is_dir():
-        assert process.poll() is None
-        time.sleep(0.01)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    for child in children:
-        while Path(f"/proc/{child}").is_dir():  # ends by itself, or the test's time limit tells
-            time.sleep(0.05)
+    swr_train_killed_at(tmp_path / "killed" / "seed_2" / "checkpoints" / "000040", killed)
     assert not (tmp_path / "killed" / "seed_2" / "checkpoints" / f"{steps:06d}").is_dir()
     swr_train(*killed, "--resume=true")
     for seed in range(3):

@@ -1,11 +1,6 @@
 """``lerobot-swr-train`` for policies that LeRobot's own loop trains, on frames in memory."""
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -18,8 +13,8 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy_config
 from safetensors.torch import load_file
 from torch.utils.data import DataLoader
+from training_command import swr_train_killed_at
 
-from lerobot_swr.cli import train as train_command
 from lerobot_swr.training import SeedsTrainConfig
 from lerobot_swr.training.memory_dataset import MemoryDataset
 from lerobot_swr.training.seed_runs import drop_incomplete, last_step
@@ -28,16 +23,6 @@ SMALL = {
     "beso": ("--policy.dim_model=16", "--policy.n_heads=2"),
     "diffusion": ("--policy.down_dims=[16,32]", "--policy.n_groups=4", "--policy.horizon=8"),
 }
-
-
-@pytest.fixture
-def swr_train(run_command):
-    """Runs ``lerobot-swr-train`` in this process."""
-
-    def run(*flags: str) -> None:
-        run_command(train_command.main, *flags)
-
-    return run
 
 
 @pytest.fixture
@@ -124,21 +109,7 @@ def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp
     steps = 200
     swr_train(*train_flags("beso", small_maze, tmp_path / "whole", steps, *flags))
     killed = train_flags("beso", small_maze, tmp_path / "killed", steps, *flags)
-    process = subprocess.Popen(
-        [sys.executable, "-c", "from lerobot_swr.cli.train import main; main()", *killed],
-        env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    while not (tmp_path / "killed/seed_1/checkpoints/000040").is_dir():
-        assert process.poll() is None
-        time.sleep(0.01)
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    for child in children:
-        while Path(f"/proc/{child}").is_dir():  # ends by itself, or the test's time limit tells
-            time.sleep(0.05)
+    swr_train_killed_at(tmp_path / "killed/seed_1/checkpoints/000040", killed)
     assert not (tmp_path / "killed/seed_1/checkpoints/000200").is_dir()
     swr_train(*killed, "--resume=true")
     for seed in range(2):

@@ -154,11 +154,12 @@ def _contracting(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             [
                 "Beyond the paper. zbc and wzbc are the paper's; corrective=noise and corrective=demos also "
                 "teach every style the way back to its demonstration, from states with noise or, where some "
-                "are near, those of other demonstrations (demos); with wzbc, to similar demonstrations, too, as far as these teach the "
-                "style. All are trained with the same steps and batches. Playback with "
-                "feedback has no policy: it plays the demonstration back that a policy would take its style "
-                "from, and corrects deviations as the corrective labels do; it needs the demonstrations when "
-                "it acts. Its seeds are those of starts and noise, the same as for the policies."
+                "are near, those of other demonstrations (demos); with wzbc, to similar demonstrations, too, "
+                "as far as these teach the style. All are trained with the same steps and batches. Playback "
+                "with feedback has no policy: it plays the demonstration back that a policy would take its "
+                "style from, and corrects deviations as the corrective labels do; it needs the "
+                "demonstrations when it acts. Its seeds are those of starts and noise, the same as for the "
+                "policies."
             ],
         )
 
