@@ -2,8 +2,8 @@
 
 The paper's five seeds, and ten: the more seeds a process trains, the less a seed costs.
 
-One run after the other, each on all cores of the machine as its defaults have it; the rate of
-`lerobot-swr-train` is that between two checkpoints, which leaves out start-up, as LeRobot's own figures do.
+One run after the other, each on all cores of the machine as its defaults have it. A rate is that between two
+checkpoints, which leaves start-up out.
 
 Then the largest parts of a step, each alone, of five stacked seeds on one thread: the matrix products forward
 and backward, and Adam.
@@ -11,7 +11,6 @@ and backward, and Adam.
 
 import argparse
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -87,41 +86,39 @@ def flags(root: Path, output_dir: Path, steps: int) -> list[str]:
     return [
         *("--policy.type=wzbc", "--policy.device=cpu", "--policy.push_to_hub=false"),
         *("--dataset.repo_id=local/only_forward", f"--dataset.root={root}", f"--batch_size={BATCH_SIZE}"),
-        *("--num_workers=0", f"--steps={steps}", f"--output_dir={output_dir}"),
+        *("--num_workers=0", "--log_freq=0", f"--steps={steps}", f"--save_freq={steps // 4}"),
+        f"--output_dir={output_dir}",
     ]
 
 
-def run(command: str, *arguments: str, **environment: str) -> str:
+def run(command: str, *arguments: str, **environment: str) -> None:
     executable = str(Path(sys.executable).with_name(command))
     environment = {**os.environ, "HF_HUB_OFFLINE": "1", **environment}
     done = subprocess.run([executable, *arguments], capture_output=True, text=True, env=environment)
     if done.returncode != 0:
         sys.exit(done.stderr[-3000:])
-    return done.stdout + done.stderr
 
 
 def lerobot_train(root: Path, output_dir: Path, steps: int, **environment: str) -> float:
-    """Steps/s of the second half of the run."""
-    more = (f"--log_freq={steps // 2}", "--save_checkpoint=false")
-    log = run("lerobot-train", *flags(root, output_dir, steps), *more, **environment)
-    update, data = (float(value) for value in re.findall(r"updt_s:([\d.]+) data_s:([\d.]+)", log)[-1])
-    return 1 / (update + data)
+    """Steps/s."""
+    run("lerobot-train", *flags(root, output_dir, steps), **environment)
+    return rate(output_dir, steps)
 
 
 def seed_train(root: Path, output_dir: Path, steps: int, seeds: Sequence[int]) -> float:
-    """Seed-steps/s between the first checkpoint of the last group to start and the end of the last one."""
-    first = steps // 4
-    more = (f"--seeds={','.join(map(str, seeds))}", "--log_freq=0", f"--save_freq={first}")
-    run("lerobot-swr-train", *flags(root, output_dir, steps), *more)
-    state = "training_state/training_step.json"
-    times = {
-        step: [
-            (output_dir / f"seed_{s}/checkpoints/{step:06d}" / state).stat().st_mtime_ns / 1e9 for s in seeds
-        ]
-        for step in (first, 2 * first, 3 * first)
-    }
-    # Each seed's own rate between its second and third checkpoint, in which all groups are under way.
-    return sum(first / (end - start) for start, end in zip(times[2 * first], times[3 * first], strict=True))
+    """Seed-steps/s: the sum of each seed's own rate, while all groups of seeds are under way."""
+    run("lerobot-swr-train", *flags(root, output_dir, steps), f"--seeds={','.join(map(str, seeds))}")
+    return sum(rate(output_dir / f"seed_{seed}", steps) for seed in seeds)
+
+
+def rate(output_dir: Path, steps: int) -> float:
+    """Steps/s of a run between its second and its third of four checkpoints."""
+    quarter = steps // 4
+    start, end = (
+        (output_dir / f"checkpoints/{step:06d}/training_state/training_step.json").stat().st_mtime_ns / 1e9
+        for step in (2 * quarter, 3 * quarter)
+    )
+    return quarter / (end - start)
 
 
 if __name__ == "__main__":
