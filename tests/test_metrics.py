@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_swr.evaluation.metrics import (
+    Interval,
     coverage,
     histogram,
     l1_distance,
@@ -89,6 +90,34 @@ def test_the_bootstrap_interval_narrows_with_rollouts_and_widens_with_differing_
 
     assert width([["a", "a", "b"] * 200]) < width([["a", "a", "b"] * 5])
     assert width([["a"] * 50, ["a", "b"] * 25]) > width([["a", "b"] * 25, ["a", "b"] * 25])
+
+
+def test_the_l1_interval_of_stratified_rollouts_keeps_them_stratified():
+    """A perfect reproducer's is [0, 0]; a style that fails in one seed of two widens it by its weight."""
+    reference, styles = {"a": 0.5, "b": 0.5}, [[0, 1, 2, 3], [3, 2, 1, 0]]
+    perfect = [["a", "a", "b", "b"], ["b", "b", "a", "a"]]
+    assert l1_interval(perfect, reference, styles) == Interval(0, 0)
+    one_fails = [["x", "a", "b", "b"], ["b", "b", "a", "a"]]  # 0.5 in one of the seeds
+    found = l1_interval(one_fails, reference, styles)
+    assert (found.low, found.high) == pytest.approx((0, 0.5), abs=0.02)
+    other_styles = l1_interval(perfect, reference, [[0, 1, 2, 3], [4, 5, 6, 7]])
+    assert other_styles.high > 0
+
+
+def test_the_l1_interval_is_as_wide_as_the_score_varies():
+    """Around the observed value; its width beside that of L1 over repeated experiments."""
+    rng = np.random.default_rng(0)
+    names, shares = ["a", "b", "c", "d"], [0.4, 0.3, 0.2, 0.1]
+    reference = dict(zip(names, [0.25] * 4, strict=True))
+    scores, widths = [], []
+    for i in range(200):
+        labels = rng.choice(names, p=shares, size=100).tolist()
+        scores.append(l1_distance(histogram(labels), reference))
+        if i < 10:
+            interval = l1_interval([labels], reference)
+            assert interval.low < scores[-1] < interval.high
+            widths.append(interval.high - interval.low)
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * np.std(scores), rel=0.25)
 
 
 def test_entropy_follows_d3ils_convention():

@@ -217,7 +217,7 @@ def test_the_readme_block_is_filled(finished, tmp_path):
     update_readme(readme, finished)
     text = readme.read_text()
     assert text == f"before\n{START}\n\n{readme_block(finished)}\n\n{END}\nafter\n"
-    assert "| small_maze | wzbc | 100,000 | 2 × 12 | 0.000 |" in text
+    assert "| small_maze | wzbc | 100,000 | 2 × 12 | 0.000 [0.000, " in text
     update_readme(readme, finished)
     assert readme.read_text() == text
 

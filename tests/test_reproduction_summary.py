@@ -101,10 +101,12 @@ def test_lengths_are_counted_as_the_demonstrations_are():
     """Three frames after the end: 68 steps are 71 frames, in the band; 60 steps are not."""
     demonstrations = {"length": [70, 75, 80, 99], "frames_after_end": 3}
     cell = result(part("aa", [0, 1], [68, 72]), part("aa", [0, 1], [60, 60]))
-    pooled, by_seed = length_control(cell, demonstrations, (70, 80))
-    assert pooled.in_band == 0.5
+    found = length_control(cell, demonstrations, (70, 80))
+    assert found.in_band.mean == 0.5
+    assert found.in_band.by_seed == [1.0, 0.0]
     # bins from 70, 75 and 80 hold a third each of the demonstrations; a half, a half and none of seed 0
-    assert by_seed == pytest.approx([1 / 6 + 1 / 6 + 1 / 3, 2.0])
+    assert found.l1_by_seed == pytest.approx([1 / 6 + 1 / 6 + 1 / 3, 2.0])
+    assert found.l1 == pytest.approx((2 / 3 + 2) / 2)
 
 
 def test_input_distribution_by_hand():

@@ -78,7 +78,7 @@ def evaluate_length_control(
             f"{min(demonstration_lengths)} to {max(demonstration_lengths)} frames"
         )
     lengths = [n + after_end for n in rollout_lengths]
-    expected, shown = (_bins(part, low) for part in (reference, lengths))
+    expected, shown = (length_bins(part, low) for part in (reference, lengths))
     floor = l1_floor(expected, len(lengths))
     return LengthControlResult(
         band=(low, high),
@@ -94,7 +94,7 @@ def evaluate_length_control(
     )
 
 
-def _bins(lengths: Sequence[int], low: int) -> list[str]:
+def length_bins(lengths: Sequence[int], low: int) -> list[str]:
     """First length of each length's bin; bins start at the band's lower end."""
     return [str(low + BIN_WIDTH * ((n - low) // BIN_WIDTH)) for n in lengths]
 

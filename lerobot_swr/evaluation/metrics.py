@@ -94,28 +94,55 @@ def l1_floor(
     return Floor(float(distances.mean()), Interval(*np.quantile(distances, [0.025, 0.975]).tolist()))
 
 
-def l1_interval(labels_by_seed: Sequence[Sequence[str]], reference: Mapping[str, float]) -> Interval:
-    """Bootstrap interval of L1 over training seeds and, within a seed, over rollouts.
+def l1_interval(
+    labels_by_seed: Sequence[Sequence[str]],
+    reference: Mapping[str, float],
+    styles_by_seed: Sequence[Sequence[int]] | None = None,
+) -> Interval:
+    """Bootstrap 95 % interval of the mean L1 over training seeds and, within a seed, over rollouts.
 
-    Resampled histograms are noisier than the observed one, so the interval leans upwards near L1 = 0.
+    Resampled histograms are noisier than the observed ones, which moves all scores upwards: the interval is
+    that of their deviations from their own mean, around the observed value.
 
     Args:
         labels_by_seed: For each training seed the labels of its rollouts.
         reference: Histogram of the demonstrations.
+        styles_by_seed: The style of each rollout, if styles were stratified: where every seed used the same
+            ones, a style's rollout is resampled from those of all seeds, so that the styles stay stratified.
     """
     rng = np.random.default_rng(0)
     names = sorted({label for labels in labels_by_seed for label in labels} | set(reference))
     place = {label: i for i, label in enumerate(names)}
-    reference_shares = np.array([reference.get(label, 0.0) for label in names])
-    counts = np.stack(
-        [np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed]
-    )  # (seeds, labels)
+    goal = np.array([reference.get(label, 0.0) for label in names])
+    shown = [np.array([place[label] for label in labels]) for labels in labels_by_seed]
+    counts = np.stack([np.bincount(labels, minlength=len(names)) for labels in shown])  # (seeds, labels)
     totals = counts.sum(axis=1)
-    chosen = rng.integers(len(counts), size=(BOOTSTRAP_DRAWS, len(counts)))
-    resampled = rng.multinomial(totals[chosen], (counts / totals[:, None])[chosen])  # (draws, seeds, labels)
-    shares = resampled / totals[chosen][..., None]
-    scores = np.abs(shares - reference_shares).sum(axis=2).mean(axis=1)
-    return Interval(*np.quantile(scores, [0.025, 0.975]).tolist())
+    observed = float(np.abs(counts / totals[:, None] - goal).sum(axis=1).mean())
+    by_style = None if styles_by_seed is None else _by_style(shown, styles_by_seed)
+    if by_style is not None:  # (seeds, rollouts)
+        n_seeds, n_rollouts = by_style.shape
+        scores = np.empty(BOOTSTRAP_DRAWS)
+        for draw in range(BOOTSTRAP_DRAWS):
+            seeds = rng.integers(n_seeds, size=by_style.shape)
+            drawn = by_style[seeds, np.arange(n_rollouts)] + len(names) * np.arange(n_seeds)[:, None]
+            resampled = np.bincount(drawn.ravel(), minlength=n_seeds * len(names)).reshape(n_seeds, -1)
+            scores[draw] = np.abs(resampled / n_rollouts - goal).sum(axis=1).mean()
+    else:
+        chosen = rng.integers(len(counts), size=(BOOTSTRAP_DRAWS, len(counts)))
+        shares = (counts / totals[:, None])[chosen]
+        multinomial = rng.multinomial(totals[chosen], shares)  # (draws, seeds, labels)
+        scores = np.abs(multinomial / totals[chosen][..., None] - goal).sum(axis=2).mean(axis=1)
+    low, high = observed + np.quantile(scores - scores.mean(), [0.025, 0.975])
+    return Interval(max(float(low), 0.0), min(float(high), 2.0))
+
+
+def _by_style(shown: Sequence[np.ndarray], styles_by_seed: Sequence[Sequence[int]]) -> np.ndarray | None:
+    """(seeds, rollouts) labels in the order of their styles; None unless all seeds used the same styles."""
+    orders = [np.argsort(styles, kind="stable") for styles in styles_by_seed]
+    ordered = [np.array(styles)[order] for styles, order in zip(styles_by_seed, orders, strict=True)]
+    if any(not np.array_equal(styles, ordered[0]) for styles in ordered):
+        return None
+    return np.stack([labels[order] for labels, order in zip(shown, orders, strict=True)])
 
 
 def success_interval(successes: Sequence[bool]) -> Interval:

@@ -11,9 +11,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.metrics import Histogram
+from lerobot_swr.evaluation.metrics import Histogram, histogram
 
 MAX_BARS = 24
+MAX_IN_LEGEND = 20  # behaviours
 PANELS_IN_A_ROW = 4
 DEMONSTRATIONS, ROLLOUTS = "0.6", "tab:blue"
 
@@ -75,13 +76,18 @@ def plot_comparison(
     columns = min(len(panels), PANELS_IN_A_ROW)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(3.3 * columns, 3.9 * rows), layout="constrained")
-    colors = behavior_colors([label for paths in panels.values() for _, label in paths])
+    demonstrated = list(histogram([label for _, label in demonstrations]))
+    shown = [label for paths in policies.values() for _, label in paths]
+    colors = behavior_colors([*demonstrated, *shown])
     grid = iter(figure.subplots(rows, columns, squeeze=False).flat)
     for (name, paths), axes in zip(panels.items(), grid, strict=False):
         draw_paths(axes, paths, colors, env_cfg)
         axes.set_title(name)
     for axes in grid:  # those that are left over
         axes.set_axis_off()
+    if len(demonstrated) <= MAX_IN_LEGEND:
+        lines = [Line2D([], [], color=colors[x], label=x) for x in demonstrated]  # type: ignore[arg-type]
+        figure.legend(handles=lines, loc="outside right center", fontsize=8, title="demonstrated")
     figure.suptitle(title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

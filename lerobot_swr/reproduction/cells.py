@@ -4,21 +4,23 @@ A finished cell is one JSON file. Its name carries a hash of all that defines th
 settings is another cell, and a file that is there is never computed again.
 """
 
+import contextlib
 import fcntl
 import hashlib
 import json
 import os
+import platform
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 FORMAT = 2  # of results; another one makes every cell a new one
-PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy")
+PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy", "mujoco", "diffusers")  # noted where installed
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ class Store:
             "result": result,
             "provenance": {
                 "seconds": round(seconds, 1),
-                "versions": {name: version(name) for name in PACKAGES},
+                "versions": installed_versions(),
             },
         }
         write_text(self.result_path(cell), json.dumps(content, separators=(",", ":")) + "\n")
@@ -197,3 +199,12 @@ def write_text(path: Path, text: str) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_text(text, encoding="utf-8")
     os.replace(temporary, path)
+
+
+def installed_versions() -> dict[str, str]:
+    """Of Python and of those of `PACKAGES` that are installed."""
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with contextlib.suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions

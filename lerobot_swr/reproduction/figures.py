@@ -43,7 +43,7 @@ def plot_histograms(path: Path, demonstrations: DatasetDescription, cells: Seque
         draw_histograms(axes, demonstrations.histogram, summary.histogram)
         axes.set_title(f"{cell.labels.policy}: L1 {summary.l1:.3f} ({summary.protocol})", fontsize=10)
         axes.tick_params(axis="x", labelsize=7)
-        axes.set(xlabel="")
+        axes.set(xlabel="behaviour")
         if cell is not cells[0]:
             axes.get_legend().remove()
         if axes.get_subplotspec().colspan.start > 0:
@@ -96,11 +96,10 @@ def plot_control(path: Path, demonstrations: DatasetDescription, cells: Sequence
             "free": length_control(pair["deterministic"].result, demonstrations.result, LENGTH_BAND),
             "controlled": length_control(pair["controlled"].result, demonstrations.result, LENGTH_BAND),
         }
-        means = [float(np.mean(by_seed)) for _, by_seed in bars.values()]
-        drawn = row[4].bar(list(bars), means, color="tab:blue", width=0.6)
-        row[4].bar_label(drawn, fmt="%.2f", label_type="center", color="white")
-        for i, (_, by_seed) in enumerate(bars.values()):
-            row[4].plot([i] * len(by_seed), by_seed, ".", color="0.2")
+        row[4].bar(list(bars), [found.l1 for found in bars.values()], color="tab:blue", width=0.6)
+        for i, found in enumerate(bars.values()):
+            row[4].plot([i] * len(found.l1_by_seed), found.l1_by_seed, ".", color="0.2")
+            row[4].text(i, max(found.l1_by_seed) + 0.05, f"{found.l1:.2f}", ha="center")
         row[4].set(ylabel="L1 to filtered training", ylim=(0, 2))
     _save(figure, path)
 
@@ -188,6 +187,7 @@ def _draw_sweep(axes: Axes, names: list[str], cells: Sequence[StoredCell]) -> No
     for name, values in lines.items():
         style = styles.get(name, "C2s--" if name == "success" else "C3s--")
         axes.plot(names, values, style, label=name, markersize=4)
+    axes.set_ylabel("L1, share of rollouts")
     axes.legend(fontsize=8)
 
 

@@ -13,7 +13,12 @@ from lerobot_swr.reproduction.summary import Rate, Summary
 Measure = Callable[[Summary], tuple[float, float, float] | None]
 """Value, and the ends of its interval; None where there is none."""
 
-MARKERS = "os^DvP"
+# Each has its colour and marker in all pictures; others take those after them.
+METHODS = (
+    *("zbc", "wzbc", "zbc corrective=noise", "zbc corrective=demos", "wzbc corrective=noise"),
+    *("playback", "bc"),
+)
+MARKERS = "os^DvPx*<"
 _ARM = ("start_radius", "action_noise", "box_push")
 
 
@@ -29,6 +34,7 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
         Whether there was something to draw.
     """
     methods = list(dict.fromkeys(cell.labels.policy for cell in cells))
+    places = {method: k for k, method in enumerate(dict.fromkeys((*METHODS, *methods)))}
     env_type = cells[0].demonstrations.env["type"]
     sizes = {label: size for label, size in SIZES[env_type].items() if len(_drawn(cells, size)) > 1}
     if not sizes:
@@ -48,9 +54,10 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
                 if points:
                     x_values, y_values, low, high = np.array(sorted(points)).T
                     x_values = x_values + apart * (i - (len(methods) - 1) / 2)
-                    marker = MARKERS[i % len(MARKERS)] + "-"
-                    axes.plot(x_values, y_values, marker, color=f"C{i}", label=method, markersize=4)
-                    axes.vlines(x_values, low, high, color=f"C{i}", linewidth=1.5, alpha=0.6)
+                    k = places[method]
+                    marker, color = MARKERS[k % len(MARKERS)] + "-", f"C{k}"
+                    axes.plot(x_values, y_values, marker, color=color, label=method, markersize=4)
+                    axes.vlines(x_values, low, high, color=color, linewidth=1.5, alpha=0.6)
             axes.set(xlabel=x_label, ylabel=name, xticks=ticks)
             if name.startswith("L1"):
                 axes.set_ylim(0, 2)
@@ -85,7 +92,9 @@ def _length_error(summary: Summary) -> tuple[float, float, float] | None:
 MEASURES: dict[str, Measure] = {
     "success": lambda s: _rate(s.success),
     "style match": lambda s: _rate(s.fidelity),
-    "L1 (each style once)": lambda s: (s.l1, s.l1_interval.low, s.l1_interval.high),
+    "L1 (each style once)": lambda s: (
+        (s.l1, s.l1_interval.low, s.l1_interval.high) if s.protocol == "stratified" else None
+    ),
     "median length error (steps)": _length_error,
 }
 

@@ -93,8 +93,8 @@ def _readme_row(cell: StoredCell) -> tuple[str, ...]:
         cell.labels.policy,
         f"{cell.training['steps']:,}",
         tables.rollouts(uniform),
-        tables.NOTHING if stratified is None else f"{stratified.l1:.3f}",
-        f"{uniform.l1:.3f} ({uniform.floor.mean:.3f})",
+        tables.NOTHING if stratified is None else tables.l1(stratified).replace("\n", " "),
+        f"{uniform.l1:.3f} ({tables.floor(uniform)})".replace("\n", " "),
         f"{success.mean:.3f} {tables.bracket(success.interval)}",
         tables.NOTHING if fidelity is None else f"{fidelity.mean:.3f}",
     )

@@ -11,7 +11,12 @@ from lerobot_swr.reproduction import contracting_tables, figures, tables
 from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.paper import SOURCE
 from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
-from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults, load_suites
+from lerobot_swr.reproduction.stored_results import (
+    DatasetDescription,
+    StoredCell,
+    SuiteResults,
+    load_suites,
+)
 
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
@@ -167,10 +172,18 @@ def _contracting(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
 def _who_teaches(cell: StoredCell) -> str:
     paper = cell.result["shares"][0]
     return (
-        "WZBC can differ from ZBC only as far as other demonstrations teach a style (last table): with "
-        f"β = {paper['beta']:g} and p = {paper['p']:g}, a style's own demonstration carries "
-        f"{paper['own']:.0%} of its weight here, others of the same behaviour {paper['same']:.0%}."
+        "How much others teach a style on the demonstrated paths (last table): with "
+        f"β = {paper['beta']:g} and p = {paper['p']:g}, its own demonstration carries {paper['own']:.0%} of "
+        f"its weight here, others of the same behaviour {paper['same']:.0%}. Beside its own path, others are "
+        "all that teaches it, however small their weight: their actions lead along their paths, not back."
     )
+
+
+def _same_by_chance(demonstrations: DatasetDescription) -> float:
+    """Share of pairs of demonstrations with the same behaviour."""
+    labels = demonstrations.result["behavior"]
+    pairs = sum(labels.count(label) - 1 for label in labels)
+    return pairs / (len(labels) * (len(labels) - 1))
 
 
 def _control(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
@@ -217,7 +230,8 @@ def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
                 Picture(
                     "Styles of the first training seed by behaviour, in the plane of their two main "
                     f"directions. Titles: share of styles whose nearest other style belongs to a "
-                    f"demonstration of the same behaviour, mean over {seeds} seeds.",
+                    f"demonstration of the same behaviour, mean over {seeds} seeds; by chance "
+                    f"{_same_by_chance(demonstrations):.2f}.",
                     picture,
                 )
             )
@@ -225,7 +239,13 @@ def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
         if swept:
             picture = pictures / f"sweep-{name}.png"
             figures.plot_sweep(picture, swept)
-            drawn.append(Picture("Effect of β and p on WZBC; figures and intervals in the table.", picture))
+            drawn.append(
+                Picture(
+                    f"Effect of β and p on WZBC, {tables.steps(swept[0])} training steps × batch, "
+                    f"{tables.rollouts(swept[0].best)} seeds × rollouts; intervals in the table.",
+                    picture,
+                )
+            )
             shown.append(tables.sweep(swept))
         yield Section(f"Similarity and styles: {name}", shown, drawn)
 
@@ -259,6 +279,7 @@ def _versions(suites: dict[str, SuiteResults]) -> str:
     for cell in cells.values():
         seconds[cell.kind == "train"] += cell.provenance["seconds"]
     return (
-        f"{', '.join(versions)}. Time of all cells, one thread each: training {seconds[True] / 3600:.2f} h, "
+        f"{', '.join(versions)}. Time of all cells, one thread each, of interrupted ones "
+        f"their last attempt: training {seconds[True] / 3600:.2f} h, "
         f"everything else {seconds[False] / 3600:.2f} h."
     )

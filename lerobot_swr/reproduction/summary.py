@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_swr.evaluation.length_control import LengthControlResult, evaluate_length_control
+from lerobot_swr.evaluation.length_control import TOLERANCE, length_bins
 from lerobot_swr.evaluation.metrics import (
     Floor,
     Histogram,
@@ -111,7 +111,9 @@ def summarize(
         n_seeds=len(parts),
         n_rollouts=len(labels[0]),
         l1=float(np.mean(l1_by_seed)),
-        l1_interval=l1_interval(labels, reference),
+        l1_interval=l1_interval(
+            labels, reference, [part["style"] for part in parts] if protocol == "stratified" else None
+        ),
         l1_by_seed=l1_by_seed,
         floor=l1_floor(
             demonstrated,
@@ -170,25 +172,52 @@ def difference_interval(
     return mean, Interval(*np.quantile(differences, [0.025, 0.975]).tolist())
 
 
+@dataclass(frozen=True)
+class LengthControl:
+    """Lengths of rollouts beside those of the demonstrations in a band.
+
+    Attributes:
+        l1: Mean over seeds of the L1 distance of the length histograms, in bins of `BIN_WIDTH` steps.
+        l1_interval: Its 95 % bootstrap interval over seeds and rollouts.
+        l1_by_seed: Of each seed.
+        floor: What perfect reproducers of the demonstrations in the band would score as the mean over as many
+            seeds.
+        in_band: Share of rollouts within the band, ± `TOLERANCE` steps.
+    """
+
+    l1: float
+    l1_interval: Interval
+    l1_by_seed: list[float]
+    floor: Floor
+    in_band: Rate
+
+
 def length_control(
     result: Mapping[str, Any], demonstrations: Mapping[str, Any], band: tuple[int, int]
-) -> tuple[LengthControlResult, list[float]]:
+) -> LengthControl:
     """Lengths of all seeds' uniform rollouts beside those of the demonstrations in a band.
 
     Args:
         result: Of an evaluation cell.
         demonstrations: Of the dataset's cell.
-        band: Shortest and longest length.
-
-    Returns:
-        The comparison over all rollouts, and each seed's L1.
+        band: Shortest and longest length, in frames of the demonstrations.
     """
-    lengths = [by_protocol["uniform"]["length"] for by_protocol in result["rollouts"].values()]
-
-    def compare(rollouts: Sequence[int]) -> LengthControlResult:
-        return evaluate_length_control(
-            rollouts, demonstrations["length"], band, demonstrations["frames_after_end"]
-        )
-
-    pooled = compare([length for of_seed in lengths for length in of_seed])
-    return pooled, [compare(of_seed).l1 for of_seed in lengths]
+    low, high = band
+    after_end = demonstrations["frames_after_end"]
+    expected = length_bins([n for n in demonstrations["length"] if low <= n <= high], low)
+    lengths = [
+        [n + after_end for n in by_protocol["uniform"]["length"]]
+        for by_protocol in result["rollouts"].values()
+    ]
+    shown = [length_bins(of_seed, low) for of_seed in lengths]
+    reference = histogram(expected)
+    by_seed = [l1_distance(histogram(bins), reference) for bins in shown]
+    return LengthControl(
+        l1=float(np.mean(by_seed)),
+        l1_interval=l1_interval(shown, reference),
+        l1_by_seed=by_seed,
+        floor=l1_floor(expected, len(shown[0]), n_averaged=len(shown)),
+        in_band=rate(
+            [[int(low - TOLERANCE <= n <= high + TOLERANCE) for n in of_seed] for of_seed in lengths]
+        ),
+    )

@@ -13,16 +13,15 @@ from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval,
 NOTHING = "–"
 
 INTERVALS = (
-    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts; resampling adds noise, so near 0 "
-    "it leans upwards and may leave the mean out]. Floor: what perfect reproducers "
+    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
     "would score as the mean over as many seeds [central 95 %]; * L1 uniform lies outside of it. "
     "Success and style fidelity: over all rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
 
 
-def number(value: float | None) -> str:
-    """Three decimals, or a dash."""
-    return NOTHING if value is None else f"{value:.3f}"
+def quoted(figures: paper.Quoted | None) -> str:
+    """The paper's L1 and success, or a dash."""
+    return NOTHING if figures is None else f"{figures.l1:.3f},\n{figures.success:.3f}"
 
 
 def bracket(interval: Interval) -> str:
@@ -74,10 +73,10 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
                 rollouts(uniform),
                 l1(uniform),
                 floor(uniform),
-                number(paper.TABLE1_L1.get((dataset, cell.policy))),
                 l1(stratified),
                 NOTHING if stratified is None else f"{stratified.floor.mean:.3f}",
                 share(cell.best.success),
+                quoted(paper.TABLE1.get((dataset, cell.policy))),
                 share(cell.best.fidelity),
                 f"{cell.best.coverage:.3f}",
             )
@@ -88,10 +87,10 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
         "seeds × n",
         "L1 uniform",
         "floor",
-        "paper's L1",
         "L1 stratified",
         "its floor",
         "success",
+        "paper's L1,\nsuccess",
         "style fidelity",
         "coverage",
     )
@@ -122,6 +121,7 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
                         l1(summary) if styled else NOTHING,
                         l1(uniform),
                         floor(uniform),
+                        quoted(paper.TABLE2.get((dataset, condition, cell.labels.policy))),
                     )
                 )
     header = (
@@ -133,15 +133,15 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         "L1 stratified",
         "L1 uniform",
         "floor",
+        "paper's L1,\nsuccess",
     )
-    quoted = ", ".join(f"{value:.3f}" for value in paper.ROBUSTNESS_WZBC_SUCCESS)
     caption = (
         f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
         "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
         f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
         "they use, of its doors those ahead of the start; L1 counts all doors, so it cannot be small from "
-        "random starts. The paper's WZBC on only_forward, in its own maze, under its three perturbations: "
-        f"success {quoted} (which is which is not known to us)."
+        "random starts. The paper's figures are of its own maze and perturbations, with styles drawn "
+        "uniformly."
     )
     return Table(caption, header, rows)
 
@@ -206,20 +206,17 @@ def control(suite: SuiteResults, dataset: str) -> Table:
     rows = []
     description = suite.datasets[dataset].result
     for cell in suite.evaluations(dataset):
-        result, by_seed = length_control(cell.result, description, LENGTH_BAND)
-        summary = cell.summaries["uniform"]
-        mean = sum(by_seed) / len(by_seed)
+        found, summary = length_control(cell.result, description, LENGTH_BAND), cell.summaries["uniform"]
         rows.append(
             (
                 cell.labels.policy,
                 "controlled" if cell.labels.condition == "controlled" else "free",
                 rollouts(summary),
-                f"{mean:.3f}\n({min(by_seed):.3f} to {max(by_seed):.3f})",
-                f"{result.l1:.3f}",
-                f"{result.l1_floor:.3f}\n{bracket(result.l1_floor_band)}",
-                f"{result.in_band:.3f}",
+                f"{found.l1:.3f}\n{bracket(found.l1_interval)}\n"
+                f"({min(found.l1_by_seed):.3f} to {max(found.l1_by_seed):.3f})",
+                f"{found.floor.mean:.3f}\n{bracket(found.floor.band)}",
+                share(found.in_band),
                 share(summary.success),
-                NOTHING,
             )
         )
     low, high = LENGTH_BAND
@@ -227,8 +224,10 @@ def control(suite: SuiteResults, dataset: str) -> Table:
     caption = (
         f"{dataset}: lengths of rollouts against those of the {n} demonstrations of {low} to {high} frames; "
         f"bins of {BIN_WIDTH} steps, styles drawn uniformly. Controlled: only styles of demonstrations in "
-        f"the band. L1 per seed: mean (lowest to highest seed); L1 of all: of all seeds' rollouts together, "
-        f"with the floor of as many draws [central 95 %]. In band: rollouts within it, ± {TOLERANCE} steps. "
+        f"the band. L1: mean over seeds [95 % bootstrap interval over seeds and rollouts], lowest to highest "
+        "seed in parentheses. Floor: what perfect reproducers of those demonstrations would score as the "
+        f"mean over as many seeds [central 95 %]. In band: rollouts within it, ± {TOLERANCE} steps [Wilson "
+        "95 %]. "
         f"{description['frames_after_end']} frames, which demonstrations record after the environment would "
         "have ended them, are added to the rollouts' lengths. The paper shows this as a figure, without "
         "numbers."
@@ -237,12 +236,10 @@ def control(suite: SuiteResults, dataset: str) -> Table:
         "policy",
         "styles",
         "seeds × n",
-        "L1 per seed",
-        "L1 of all",
+        "L1",
         "floor",
         "in band",
         "success",
-        "paper",
     )
     return Table(caption, header, rows)
 
