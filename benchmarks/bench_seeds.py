@@ -43,10 +43,10 @@ def main() -> None:
             f"lerobot-train:     {single:7.1f} steps/s, {one_thread:.1f} with OMP_NUM_THREADS=1", flush=True
         )
         for count in COUNTS_OF_SEEDS:
-            many = seed_train(root, Path(folder) / f"{count}_seeds", steps, range(count))
+            many, whole = seed_train(root, Path(folder) / f"{count}_seeds", steps, range(count))
             print(
                 f"lerobot-swr-train: {many:7.1f} seed-steps/s ({count} seeds), {many / single:.1f} times, "
-                f"{many / one_thread:.1f} times that of one thread",
+                f"{many / one_thread:.1f} times that of one thread; on the whole {whole:.1f}",
                 flush=True,
             )
         each = ", ".join(f"{name} {1e6 * seconds:.0f} µs" for name, seconds in largest_parts(root).items())
@@ -102,23 +102,29 @@ def run(command: str, *arguments: str, **environment: str) -> None:
 def lerobot_train(root: Path, output_dir: Path, steps: int, **environment: str) -> float:
     """Steps/s."""
     run("lerobot-train", *flags(root, output_dir, steps), **environment)
-    return rate(output_dir, steps)
+    return rate(checkpoint_times(output_dir, steps), steps)
 
 
-def seed_train(root: Path, output_dir: Path, steps: int, seeds: Sequence[int]) -> float:
-    """Seed-steps/s: the sum of each seed's own rate, while all groups of seeds are under way."""
+def seed_train(root: Path, output_dir: Path, steps: int, seeds: Sequence[int]) -> tuple[float, float]:
+    """Seed-steps/s while all groups of seeds are under way, and on the whole from the first checkpoint on.
+
+    The second is less where groups differ in size: the smaller one's core has nothing to do at the end.
+    """
     run("lerobot-swr-train", *flags(root, output_dir, steps), f"--seeds={','.join(map(str, seeds))}")
-    return sum(rate(output_dir / f"seed_{seed}", steps) for seed in seeds)
+    times = [checkpoint_times(output_dir / f"seed_{seed}", steps) for seed in seeds]
+    elapsed = max(t[-1] for t in times) - min(t[0] for t in times)
+    return sum(rate(t, steps) for t in times), len(seeds) * 3 * (steps // 4) / elapsed
 
 
-def rate(output_dir: Path, steps: int) -> float:
-    """Steps/s of a run between its second and its third of four checkpoints."""
-    quarter = steps // 4
-    start, end = (
-        (output_dir / f"checkpoints/{step:06d}/training_state/training_step.json").stat().st_mtime_ns / 1e9
-        for step in (2 * quarter, 3 * quarter)
-    )
-    return quarter / (end - start)
+def checkpoint_times(output_dir: Path, steps: int) -> list[float]:
+    """When each of a run's four checkpoints was written, in seconds."""
+    folders = [output_dir / f"checkpoints/{k * (steps // 4):06d}/training_state" for k in (1, 2, 3, 4)]
+    return [(folder / "training_step.json").stat().st_mtime_ns / 1e9 for folder in folders]
+
+
+def rate(times: Sequence[float], steps: int) -> float:
+    """Steps/s of a run between its second and its third checkpoint."""
+    return (steps // 4) / (times[2] - times[1])
 
 
 if __name__ == "__main__":
