@@ -11,6 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import EpisodeAwareSampler
 from lerobot.policies.factory import get_policy_class, make_policy_config
+from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
 from training_command import swr_train_killed_at
 
@@ -312,6 +313,25 @@ def test_a_command_that_failed_at_its_start_can_be_corrected(swr_train, small_ma
     assert "observation.speed" in capfd.readouterr().err
     swr_train(*flags)
     assert weights(tmp_path / "run/seed_0", 4)
+
+
+def test_lerobot_eval_rolls_a_seed_out(swr_train, run_command, small_maze, tmp_path):
+    """The folder of a seed is a checkpoint like any other."""
+    flags = train_flags("wzbc", small_maze, tmp_path / "run", 4, *SMALL, "--seeds=3", "--jobs=1")
+    swr_train(*flags)
+    run_command(
+        lerobot_eval.main,
+        f"--policy.path={tmp_path / 'run/seed_3/checkpoints/last/pretrained_model'}",
+        *(
+            "--env.type=maze2d",
+            "--env.task=small",
+            "--env.episode_length=12",
+            "--eval.n_episodes=1",
+            "--eval.batch_size=1",
+        ),
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    assert (tmp_path / "eval" / "eval_info.json").is_file()
 
 
 def test_the_last_link_is_mended(swr_train, small_maze, tmp_path):
