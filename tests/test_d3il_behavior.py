@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lerobot_swr.envs.d3il.behavior import (
@@ -36,7 +36,6 @@ def benchmark_bits(path):
     return bits
 
 
-@settings(deadline=None)
 @given(st.integers(0, 2**32 - 1))
 def test_mode_bits_equal_the_benchmarks(seed):
     """On random walks towards the finish line, the bits equal the benchmark's."""

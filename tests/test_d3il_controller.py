@@ -21,7 +21,7 @@ def kinematics(joints):
     return position, rotation, jacobian
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1))
 def test_kinematics_equal_mujocos(seed):
     """Pose and Jacobian of the tool equal MuJoCo's forward kinematics of the same joints."""
@@ -41,7 +41,7 @@ def test_kinematics_equal_mujocos(seed):
     np.testing.assert_allclose(jacobian, np.concatenate([linear, angular])[:, :7], atol=1e-9)
 
 
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 @given(st.integers(0, 2**32 - 1), st.floats(-8, 1))
 def test_clipped_solve_equals_singular_values(seed, smallest_exponent):
     """The solver equals V diag(1 / clip(s, 0.01, 100)) U^T b from numpy's SVD, whether or not it clips."""

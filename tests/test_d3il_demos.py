@@ -193,7 +193,7 @@ def test_frames_are_inverse(angle, x, y):
     assert abs(wrap(angle)) <= math.pi
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(st.floats(-1.2, 1.2), st.floats(-0.1, 0.1), st.floats(-1.2, 1.2))
 def test_steering_law_brings_a_vehicle_home(heading, lateral, goal_angle):
     """A point that moves along its heading with the law's curvature ends at the goal with its heading."""

@@ -69,7 +69,7 @@ CONDITIONS = st.recursive(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(table=tables(), condition=CONDITIONS)
 def test_random_filters_agree_with_plain_python(table, condition):
     """The independent oracle is Python's own `eval`, row by row."""
@@ -78,7 +78,7 @@ def test_random_filters_agree_with_plain_python(table, condition):
     assert select(condition, table).tolist() == expected
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(text=st.text(max_size=60) | st.text("()[]{}'\".,:+-*/=<>!&|^~@lambda inotrx0123_ \n\\", max_size=60))
 def test_any_text_is_a_filter_or_a_filter_error(text):
     """No text whatever raises anything else than a `FilterError`."""

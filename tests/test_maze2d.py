@@ -28,7 +28,7 @@ def test_the_environment_follows_gymnasiums_contract(task, start):
     check_env(Maze2DEnv(task=task, start=start, transition_noise=0.5, render_mode="rgb_array"))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.tuples(unit, unit), st.tuples(coordinate, coordinate), st.booleans())
 def test_no_step_passes_a_wall_outside_its_doors(position, displacement, sticky):
     """Wherever an agent steps, it stays in the maze and changes sides of a wall only through a door."""

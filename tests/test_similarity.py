@@ -80,7 +80,7 @@ def test_row_normalization_follows_the_paper():
     assert not np.allclose(nu, nu.T)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(episodes)
 def test_dissimilarities_are_bounded_and_zero_on_the_diagonal(states):
     """For any episodes: 0 on the diagonal, in [0, 1], never NaN; symmetric under global normalisation."""
