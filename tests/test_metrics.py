@@ -92,16 +92,23 @@ def test_the_bootstrap_interval_narrows_with_rollouts_and_widens_with_differing_
     assert width([["a"] * 50, ["a", "b"] * 25]) > width([["a", "b"] * 25, ["a", "b"] * 25])
 
 
-def test_the_l1_interval_of_stratified_rollouts_keeps_them_stratified():
-    """A perfect reproducer's is [0, 0]; a style that fails in one seed of two widens it by its weight."""
-    reference, styles = {"a": 0.5, "b": 0.5}, [[0, 1, 2, 3], [3, 2, 1, 0]]
-    perfect = [["a", "a", "b", "b"], ["b", "b", "a", "a"]]
-    assert l1_interval(perfect, reference, styles) == Interval(0, 0)
-    one_fails = [["x", "a", "b", "b"], ["b", "b", "a", "a"]]  # 0.5 in one of the seeds
-    found = l1_interval(one_fails, reference, styles)
-    assert (found.low, found.high) == pytest.approx((0, 0.5), abs=0.02)
-    other_styles = l1_interval(perfect, reference, [[0, 1, 2, 3], [4, 5, 6, 7]])
-    assert other_styles.high > 0
+def test_the_l1_interval_of_stratified_rollouts_is_that_of_their_seeds():
+    """A perfect reproducer's is [0, 0]; seeds that differ count as whole seeds, as in a t interval."""
+    reference = {"a": 0.5, "b": 0.5}
+    perfect, failed = ["a", "b"] * 5, ["x"] * 10
+    assert l1_interval([perfect] * 3, reference, stratified=True) == Interval(0, 0)
+    shares = np.random.default_rng(0).integers(11, size=60)  # of failures, in tenths
+    seeds = [["x"] * k + perfect[: 10 - k] for k in shares.tolist()]
+    scores = [l1_distance(histogram(labels), reference) for labels in seeds]
+    found = l1_interval(seeds, reference, stratified=True)
+    error = 1.96 * np.std(scores, ddof=1) / len(scores) ** 0.5
+    assert (found.low, found.high) == pytest.approx(
+        (np.mean(scores) - error, np.mean(scores) + error), abs=0.02
+    )
+    mixed = l1_interval([perfect] * 4 + [failed], reference, stratified=True)
+    assert mixed.low == 0
+    assert mixed.high > 0.9
+    assert l1_interval([perfect], reference, stratified=True).high > 0  # of a single seed: over rollouts
 
 
 def test_the_l1_interval_is_as_wide_as_the_score_varies():

@@ -95,9 +95,7 @@ def l1_floor(
 
 
 def l1_interval(
-    labels_by_seed: Sequence[Sequence[str]],
-    reference: Mapping[str, float],
-    styles_by_seed: Sequence[Sequence[int]] | None = None,
+    labels_by_seed: Sequence[Sequence[str]], reference: Mapping[str, float], stratified: bool = False
 ) -> Interval:
     """Bootstrap 95 % interval of the mean L1 over training seeds and, within a seed, over rollouts.
 
@@ -107,42 +105,30 @@ def l1_interval(
     Args:
         labels_by_seed: For each training seed the labels of its rollouts.
         reference: Histogram of the demonstrations.
-        styles_by_seed: The style of each rollout, if styles were stratified: where every seed used the same
-            ones, a style's rollout is resampled from those of all seeds, so that the styles stay stratified.
+        stratified: Every style was used equally often. Resampled rollouts would no longer be stratified, so
+            whole seeds are resampled, if there are several; deviations are widened by √(n / (n − 1)), by
+            which the mean of n resampled seeds varies too little.
     """
     rng = np.random.default_rng(0)
     names = sorted({label for labels in labels_by_seed for label in labels} | set(reference))
     place = {label: i for i, label in enumerate(names)}
     goal = np.array([reference.get(label, 0.0) for label in names])
-    shown = [np.array([place[label] for label in labels]) for labels in labels_by_seed]
-    counts = np.stack([np.bincount(labels, minlength=len(names)) for labels in shown])  # (seeds, labels)
+    counts = np.stack(
+        [np.bincount([place[label] for label in labels], minlength=len(names)) for labels in labels_by_seed]
+    )  # (seeds, labels)
     totals = counts.sum(axis=1)
-    observed = float(np.abs(counts / totals[:, None] - goal).sum(axis=1).mean())
-    by_style = None if styles_by_seed is None else _by_style(shown, styles_by_seed)
-    if by_style is not None:  # (seeds, rollouts)
-        n_seeds, n_rollouts = by_style.shape
-        scores = np.empty(BOOTSTRAP_DRAWS)
-        for draw in range(BOOTSTRAP_DRAWS):
-            seeds = rng.integers(n_seeds, size=by_style.shape)
-            drawn = by_style[seeds, np.arange(n_rollouts)] + len(names) * np.arange(n_seeds)[:, None]
-            resampled = np.bincount(drawn.ravel(), minlength=n_seeds * len(names)).reshape(n_seeds, -1)
-            scores[draw] = np.abs(resampled / n_rollouts - goal).sum(axis=1).mean()
+    by_seed = np.abs(counts / totals[:, None] - goal).sum(axis=1)
+    n_seeds = len(counts)
+    chosen = rng.integers(n_seeds, size=(BOOTSTRAP_DRAWS, n_seeds))
+    if stratified and n_seeds > 1:
+        scores, widening = by_seed[chosen].mean(axis=1), (n_seeds / (n_seeds - 1)) ** 0.5
     else:
-        chosen = rng.integers(len(counts), size=(BOOTSTRAP_DRAWS, len(counts)))
-        shares = (counts / totals[:, None])[chosen]
-        multinomial = rng.multinomial(totals[chosen], shares)  # (draws, seeds, labels)
-        scores = np.abs(multinomial / totals[chosen][..., None] - goal).sum(axis=2).mean(axis=1)
-    low, high = observed + np.quantile(scores - scores.mean(), [0.025, 0.975])
+        resampled = rng.multinomial(totals[chosen], (counts / totals[:, None])[chosen])
+        shares = resampled / totals[chosen][..., None]  # (draws, seeds, labels)
+        scores, widening = np.abs(shares - goal).sum(axis=2).mean(axis=1), 1.0
+    deviations = widening * np.quantile(scores - scores.mean(), [0.025, 0.975])
+    low, high = by_seed.mean() + deviations
     return Interval(max(float(low), 0.0), min(float(high), 2.0))
-
-
-def _by_style(shown: Sequence[np.ndarray], styles_by_seed: Sequence[Sequence[int]]) -> np.ndarray | None:
-    """(seeds, rollouts) labels in the order of their styles; None unless all seeds used the same styles."""
-    orders = [np.argsort(styles, kind="stable") for styles in styles_by_seed]
-    ordered = [np.array(styles)[order] for styles, order in zip(styles_by_seed, orders, strict=True)]
-    if any(not np.array_equal(styles, ordered[0]) for styles in ordered):
-        return None
-    return np.stack([labels[order] for labels, order in zip(shown, orders, strict=True)])
 
 
 def success_interval(successes: Sequence[bool]) -> Interval:

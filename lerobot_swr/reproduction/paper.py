@@ -1,7 +1,7 @@
 """Numbers of the paper that stand beside ours.
 
 Its mazes, demonstrations and magnitudes of perturbation are others than ours, so the figures tell the order
-of magnitude and nothing more. Means over its training seeds, styles drawn uniformly; DDPM-GPT and DDPM-ACT
+of magnitude and nothing more. Means over its training seeds; DDPM-GPT and DDPM-ACT
 are its names of ``ddpm_gpt`` and ``ddpm_act``. The figures are those of the authors' page of it,
 https://github.com/mathieu-petitbois/mathieu-petitbois.github.io, projects/swr, commit 66dcc12.
 """

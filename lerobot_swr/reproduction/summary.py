@@ -111,9 +111,7 @@ def summarize(
         n_seeds=len(parts),
         n_rollouts=len(labels[0]),
         l1=float(np.mean(l1_by_seed)),
-        l1_interval=l1_interval(
-            labels, reference, [part["style"] for part in parts] if protocol == "stratified" else None
-        ),
+        l1_interval=l1_interval(labels, reference, protocol == "stratified"),
         l1_by_seed=l1_by_seed,
         floor=l1_floor(
             demonstrated,

@@ -13,7 +13,8 @@ from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval,
 NOTHING = "–"
 
 INTERVALS = (
-    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts]. Floor: what perfect reproducers "
+    "L1: mean over seeds [95 % bootstrap interval over seeds and rollouts; stratified: over seeds]. Floor: "
+    "what perfect reproducers "
     "would score as the mean over as many seeds [central 95 %]; * L1 uniform lies outside of it. "
     "Success and style fidelity: over all rollouts [Wilson 95 %], lowest to highest seed in parentheses."
 )
@@ -121,7 +122,7 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
                         l1(summary) if styled else NOTHING,
                         l1(uniform),
                         floor(uniform),
-                        quoted(paper.TABLE2.get((dataset, condition, cell.labels.policy))),
+                        quoted(paper.TABLE2.get((dataset, condition, cell.policy))),
                     )
                 )
     header = (
@@ -140,8 +141,7 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
         f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
         "they use, of its doors those ahead of the start; L1 counts all doors, so it cannot be small from "
-        "random starts. The paper's figures are of its own maze and perturbations, with styles drawn "
-        "uniformly."
+        "random starts. The paper's figures are of its own maze and perturbations."
     )
     return Table(caption, header, rows)
 
