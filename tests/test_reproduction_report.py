@@ -20,7 +20,7 @@ from lerobot_swr.reproduction.demonstrations import (
     short_path,
 )
 from lerobot_swr.reproduction.execution import run_cells
-from lerobot_swr.reproduction.perturbation_curves import SIZES
+from lerobot_swr.reproduction.perturbation_curves import SIZES, short_names
 from lerobot_swr.reproduction.publication import END, START, publish, readme_block, update_readme, with_block
 from lerobot_swr.reproduction.report import write_results_report
 from lerobot_swr.reproduction.settings import SUITES, ReproductionSettings
@@ -242,3 +242,11 @@ def test_an_empty_folder_is_named(tmp_path, run_command, capsys):
     with pytest.raises(SystemExit):
         run_command(report_command, tmp_path)
     assert "no suites/*.json there; run lerobot-swr-reproduce first" in capsys.readouterr().err
+
+
+def test_curves_are_named_by_what_differs():
+    """Options that all methods have tell nothing."""
+    assert short_names(["zbc", "wzbc p=0.95"]) == {"zbc": "zbc", "wzbc p=0.95": "wzbc p=0.95"}
+    found = short_names(["zbc hidden_dim=16", "wzbc hidden_dim=16 p=0.95"])
+    assert list(found.values()) == ["zbc", "wzbc p=0.95"]
+    assert short_names(["zbc hidden_dim=16"]) == {"zbc hidden_dim=16": "zbc hidden_dim=16"}

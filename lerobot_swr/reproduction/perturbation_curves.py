@@ -13,7 +13,7 @@ from lerobot_swr.reproduction.summary import Rate, Summary
 Measure = Callable[[Summary], tuple[float, float, float] | None]
 """Value, and the ends of its interval; None where there is none."""
 
-# Each has its colour and marker in all pictures; others take those after them.
+# Each has its colour and marker in all pictures; others take those after them, in the order of the picture.
 METHODS = (
     *("zbc", "wzbc", "zbc corrective=noise", "zbc corrective=demos", "wzbc corrective=noise"),
     *("playback", "bc"),
@@ -34,7 +34,8 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
         Whether there was something to draw.
     """
     methods = list(dict.fromkeys(cell.labels.policy for cell in cells))
-    places = {method: k for k, method in enumerate(dict.fromkeys((*METHODS, *methods)))}
+    names = short_names(methods)
+    places = {name: k for k, name in enumerate(dict.fromkeys((*METHODS, *names.values())))}
     env_type = cells[0].demonstrations.env["type"]
     sizes = {label: size for label, size in SIZES[env_type].items() if len(_drawn(cells, size)) > 1}
     if not sizes:
@@ -54,9 +55,9 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
                 if points:
                     x_values, y_values, low, high = np.array(sorted(points)).T
                     x_values = x_values + apart * (i - (len(methods) - 1) / 2)
-                    k = places[method]
+                    k = places[names[method]]
                     marker, color = MARKERS[k % len(MARKERS)] + "-", f"C{k}"
-                    axes.plot(x_values, y_values, marker, color=color, label=method, markersize=4)
+                    axes.plot(x_values, y_values, marker, color=color, label=names[method], markersize=4)
                     axes.vlines(x_values, low, high, color=color, linewidth=1.5, alpha=0.6)
             axes.set(xlabel=x_label, ylabel=name, xticks=ticks)
             if name.startswith("L1"):
@@ -70,6 +71,16 @@ def plot_perturbations(path: Path, cells: Sequence[StoredCell], measures: Sequen
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=100)
     return True
+
+
+def short_names(methods: Sequence[str]) -> dict[str, str]:
+    """Names without the options that all methods have."""
+    options = [method.split(" ")[1:] for method in methods]
+    shared = set(options[0]).intersection(*options[1:]) if len(methods) > 1 else set()
+    return {
+        method: " ".join([method.split(" ")[0], *(word for word in words if word not in shared)])
+        for method, words in zip(methods, options, strict=True)
+    }
 
 
 def _drawn(cells: Sequence[StoredCell], size: Callable[[Mapping[str, Any]], float | None]) -> set[float]:
