@@ -250,3 +250,16 @@ def test_curves_are_named_by_what_differs():
     found = short_names(["zbc hidden_dim=16", "wzbc hidden_dim=16 p=0.95"])
     assert list(found.values()) == ["zbc", "wzbc p=0.95"]
     assert short_names(["zbc hidden_dim=16"]) == {"zbc hidden_dim=16": "zbc hidden_dim=16"}
+
+
+def test_the_markdown_report_has_the_tables_of_the_page_and_links_its_pictures(drawn):
+    """Every row of a table is a line, and every picture that is linked exists."""
+    text = (drawn / "report.md").read_text()
+    page = (drawn / "report.html").read_text()
+    assert text.count("\n## ") == page.count("<h2>")
+    lines = [line for line in text.splitlines() if line.startswith("| ")]
+    assert len(lines) == page.count("<tr>")
+    assert all(before == "" for before in re.findall(r"(.*)\n\| [^\n]*\|\n\|---", text))
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
+    assert len(pictures) == page.count("<img")
+    assert all((drawn / picture).is_file() for picture in pictures)

@@ -1,6 +1,7 @@
-"""One self-contained HTML page from tables and pictures."""
+"""A report from tables and pictures: one self-contained HTML page, or Markdown beside its pictures."""
 
 import base64
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,43 @@ TEMPLATE = """<!doctype html>
 <p class="note">{{ versions }}</p>
 </body>
 </html>
+"""
+
+MARKDOWN = """# {{ title }}
+
+{{ introduction | text }}
+{% for section in sections %}
+
+## {{ section.title | text }}
+{% for paragraph in section.text %}
+
+{{ paragraph | text }}
+{% endfor %}
+{% for table in section.tables %}
+
+{{ table.caption | text }}
+
+| {{ table.header | map("text") | join(" | ") }} |
+|{{ "---|" * table.header | length }}
+{% for row in table.rows %}
+| {{ row | map("text") | join(" | ") }} |
+{% endfor %}
+{% endfor %}
+{% for figure in section.figures %}
+
+![{{ figure.path.stem }}]({{ figure | place }})
+
+{{ figure.caption | text }}
+{% endfor %}
+{% endfor %}
+
+## How this was made
+
+```bash
+{{ commands | join("\n") }}
+```
+
+{{ versions | text }}
 """
 
 
@@ -113,3 +151,33 @@ def write_report(
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")
+
+
+def write_markdown(
+    path: Path,
+    title: str,
+    introduction: str,
+    sections: Sequence[Section],
+    commands: Sequence[str],
+    versions: str,
+) -> None:
+    """Write the same as `write_report` in Markdown, with links to the pictures.
+
+    Args:
+        path: The Markdown file.
+        title: Heading of the page.
+        introduction: A paragraph below it.
+        sections: The page's body.
+        commands: What to type to make the results again.
+        versions: Software versions.
+    """
+    environment = Environment(trim_blocks=True)
+    environment.filters["text"] = lambda text: (
+        text.replace("*", r"\*").replace("|", r"\|").replace("~", r"\~").replace("\n", "<br>")
+    )
+    environment.filters["place"] = lambda figure: os.path.relpath(figure.path, path.parent)
+    page = environment.from_string(MARKDOWN).render(
+        title=title, introduction=introduction, sections=sections, commands=commands, versions=versions
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page.rstrip() + "\n", encoding="utf-8")

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from lerobot_swr.evaluation.report import Picture, Section, write_report
+from lerobot_swr.evaluation.report import Picture, Section, write_markdown, write_report
 from lerobot_swr.reproduction import contracting_tables, figures, tables
 from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.paper import SOURCE
@@ -29,7 +29,7 @@ INTRODUCTION = (
 
 
 def write_results_report(root: Path) -> Path:
-    """Write ``report.html``, its pictures and ``summaries.json`` from the stored results.
+    """Write ``report.html``, ``report.md``, their pictures and ``summaries.json`` from the stored results.
 
     Args:
         root: Folder with ``suites/`` and ``results/``.
@@ -58,14 +58,15 @@ def write_results_report(root: Path) -> Path:
     write_text(root / "summaries.json", json.dumps(_summaries(suites), indent=1) + "\n")
     report = root / "report.html"
     commands = [suite.command for suite in suites.values() if suite.command]
-    write_report(
-        report,
+    content = (
         "Reproducing and controlling the diversity of demonstrations",
         INTRODUCTION,
         sections,
         [*dict.fromkeys(commands), f"lerobot-swr-report {root}"],
         _versions(suites),
     )
+    write_report(report, *content)
+    write_markdown(root / "report.md", *content)
     return report
 
 
