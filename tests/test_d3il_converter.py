@@ -4,6 +4,7 @@ import os
 import pickle
 import subprocess
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from lerobot.datasets import LeRobotDataset
@@ -12,6 +13,7 @@ from lerobot_swr.cli.dataset import main
 from lerobot_swr.demos.d3il_converter import convert_recording, recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.restricted_pickle import UnsafePickleError, load_recording
+from lerobot_swr.envs.d3il.configuration_d3il import GYM_IDS
 
 TURNED = [np.cos(0.2), 0.0, 0.0, np.sin(0.2)]
 
@@ -138,7 +140,7 @@ def test_damaged_files_are_named(tmp_path, content):
 
 
 def test_observations_and_actions(tmp_path):
-    """Observations are the states without the last, actions the differences of the desired position."""
+    """What was measured is taken one frame later than what was desired; actions are the latter's differences."""
     recording = aligning_recording()
     demonstration = convert_recording(dump(tmp_path / "a.pkl", recording), "aligning")
     robot, box = recording["robot"], recording["push-box"]
@@ -146,11 +148,50 @@ def test_observations_and_actions(tmp_path):
     scene = demonstration.observations["observation.environment_state"]
     assert state.shape == (29, 6)
     assert scene.shape == (29, 14)
-    np.testing.assert_allclose(state[7], [*robot["des_c_pos"][7], *robot["c_pos"][7]], rtol=1e-6)
-    np.testing.assert_allclose(scene[7, :7], [*box["pos"][7], *box["quat"][7]], rtol=1e-6)
+    np.testing.assert_allclose(state[7], [*robot["des_c_pos"][7], *robot["c_pos"][8]], rtol=1e-6)
+    np.testing.assert_allclose(scene[7, :7], [*box["pos"][8], *box["quat"][8]], rtol=1e-6)
     np.testing.assert_allclose(
         demonstration.actions[7], robot["des_c_pos"][8] - robot["des_c_pos"][7], rtol=1e-4, atol=1e-9
     )
+
+
+def recorded_as_the_benchmark_does(env, actions):
+    """Observations of an episode of our environment, and its recording in the benchmark's timing.
+
+    The benchmark notes, before each step's physics, the position that is desired from then on and everything
+    as it was measured before; one more frame, of a step without a move, ends the recording.
+    """
+    n = env.action_space.shape[0]
+    observations = [env.reset(seed=3)[0], *(env.step(action)[0] for action in actions)]
+    start = np.array(env._start_tool)
+    desired = start + np.pad(np.cumsum([[0.0] * n, *actions, [0.0] * n], axis=0), ((0, 0), (0, 3 - n)))
+    measured = [observations[0], *observations]  # before the first step everything is at rest
+    tool = np.stack([m["agent_pos"][n:] for m in measured]).astype(np.float64)
+    scene = np.stack([m["environment_state"] for m in measured]).astype(np.float64)
+    recording = {"robot": {"des_c_pos": desired, "c_pos": np.pad(tool, ((0, 0), (0, 3 - n)))}}
+    if n == 3:
+        recording["push-box"] = {"pos": scene[:, :3], "quat": scene[:, 3:7]}
+        recording["target-box"] = {"pos": scene[:, 7:10], "quat": scene[:, 10:14]}
+    return observations, recording
+
+
+@pytest.mark.parametrize("task", ["avoiding", "aligning"])
+def test_a_recording_becomes_what_the_environment_observes(tmp_path, task):
+    """Our environment, recorded in the benchmark's timing and converted, gives back its own observations."""
+    pytest.importorskip("mujoco")
+    env = gym.make(f"lerobot_swr.envs.d3il.configuration_d3il:{GYM_IDS[task]}").unwrapped
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(0, 0.008, (30, env.action_space.shape[0])) * (1, 1, -1)[: env.action_space.shape[0]]
+    actions[10:13] = 0  # a pause
+    observations, recording = recorded_as_the_benchmark_does(env, actions)
+
+    converted = convert_recording(dump(tmp_path / "a.pkl", recording), task)
+
+    assert len(converted.actions) == len(observations)
+    np.testing.assert_allclose(converted.actions[:-1], actions, atol=1e-7)
+    for ours, key in (("agent_pos", "state"), ("environment_state", "environment_state")):
+        expected = np.stack([observation[ours] for observation in observations])
+        np.testing.assert_allclose(converted.observations[f"observation.{key}"], expected, atol=1e-6)
 
 
 def without(recording, group, key=None):

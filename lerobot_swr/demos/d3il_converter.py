@@ -2,8 +2,13 @@
 
 A recording is a pickled dictionary of arrays over T states: ``robot`` with the desired and the actual tool
 position ``des_c_pos`` and ``c_pos`` (T, 3), and for aligning ``push-box`` and ``target-box`` with ``pos`` (T,
-3) and ``quat`` (T, 4, w first). As in the benchmark (Jia et al., ICLR 2024), observations are the states
-without the last one, and actions the differences of the desired position.
+3) and ``quat`` (T, 4, w first). As in the benchmark (Jia et al., ICLR 2024), actions are the differences of
+the desired position.
+
+The benchmark records desired and measured quantities together *before* the robot moves: frame t holds where
+the tool is to go and where everything was before it went there. Our environments observe *after* the step, so
+the state that belongs to frame t is its desired position with what was measured one frame later. A state that
+keeps the recorded pairs is one step staler than any that a policy meets in the environment.
 """
 
 import logging
@@ -79,7 +84,10 @@ def _listed_recordings(folder: Path, file_list: Path) -> list[Path]:
 
 
 def convert_recording(path: Path, task: str) -> Demonstration:
-    """Read one recording.
+    """Read one recording of T frames as the T - 1 states and actions that our environment would have recorded.
+
+    Measured quantities (tool, boxes) are taken one frame later than the desired position beside them, so the
+    last frame has no state of its own.
 
     Raises:
         ValueError: Naming the file and the key, if a key is missing or its array has a wrong shape or is not
@@ -111,8 +119,8 @@ def convert_recording(path: Path, task: str) -> Demonstration:
         )
     return Demonstration(
         {
-            "observation.state": np.concatenate([desired, actual], axis=1)[:-1].astype(np.float32),
-            "observation.environment_state": scene[:-1].astype(np.float32),
+            "observation.state": np.concatenate([desired[:-1], actual[1:]], axis=1).astype(np.float32),
+            "observation.environment_state": scene[1:].astype(np.float32),
         },
         actions.astype(np.float32),
     )
