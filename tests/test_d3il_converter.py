@@ -140,7 +140,7 @@ def test_damaged_files_are_named(tmp_path, content):
 
 
 def test_observations_and_actions(tmp_path):
-    """What was measured is taken one frame later than what was desired; actions are the latter's differences."""
+    """What was measured is taken a frame later than what was desired, whose differences are the actions."""
     recording = aligning_recording()
     demonstration = convert_recording(dump(tmp_path / "a.pkl", recording), "aligning")
     robot, box = recording["robot"], recording["push-box"]

@@ -84,7 +84,7 @@ def _listed_recordings(folder: Path, file_list: Path) -> list[Path]:
 
 
 def convert_recording(path: Path, task: str) -> Demonstration:
-    """Read one recording of T frames as the T - 1 states and actions that our environment would have recorded.
+    """Read one recording of T frames as the T - 1 states and actions that our environment would record.
 
     Measured quantities (tool, boxes) are taken one frame later than the desired position beside them, so the
     last frame has no state of its own.
