@@ -10,9 +10,10 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_swr.cli.dataset import main
-from lerobot_swr.demos.d3il_converter import convert_recording, recorded_recipe
+from lerobot_swr.demos.d3il_converter import UNBALANCED_COUNTS, convert_recording, recorded_recipe, unbalanced
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.restricted_pickle import UnsafePickleError, load_recording
+from lerobot_swr.envs.d3il.behavior import AVOIDING_BEHAVIORS
 from lerobot_swr.envs.d3il.configuration_d3il import GYM_IDS
 
 TURNED = [np.cos(0.2), 0.0, 0.0, np.sin(0.2)]
@@ -245,6 +246,31 @@ def test_dataset_of_recordings(tmp_path):
     assert listed.n_episodes == 1
 
 
+def test_the_unbalanced_selection_keeps_its_counts():
+    """Every behaviour stays, as often as its count says or as there are recordings; the seed chooses which."""
+    labels = [behavior for behavior in AVOIDING_BEHAVIORS for _ in range(4)]
+    del labels[0]  # three are left of the first behaviour
+    chosen = unbalanced(labels, seed=0)
+    assert chosen == sorted(set(chosen))
+    assert chosen == unbalanced(labels, seed=0)
+    assert chosen != unbalanced(labels, seed=1)
+    kept = [sum(labels[i] == behavior for i in chosen) for behavior in AVOIDING_BEHAVIORS]
+    assert kept[0] == 3
+    assert sorted(kept, reverse=True) == sorted([*UNBALANCED_COUNTS[1:], 3], reverse=True)
+
+
+def test_a_selection_is_written_as_a_dataset(tmp_path):
+    """`--task=unbalanced_avoiding` keeps of a way's recordings as many as its count says."""
+    for i in range(5):
+        dump(tmp_path / "in" / f"env_{i}.pkl", avoiding_recording(40 + i, x=0.4))
+    recipe = recorded_recipe(tmp_path / "in", "unbalanced_avoiding")
+    places = [AVOIDING_BEHAVIORS[7 * k % 24] for k in range(24)]
+    expected = UNBALANCED_COUNTS[places.index("top-top-midtop")]
+    assert recipe.name == "d3il_human_unbalanced_avoiding"
+    assert recipe.n_episodes == expected < 5
+    assert write_dataset(recipe, tmp_path / "out") == {"top-top-midtop": expected}
+
+
 def test_one_bad_recording_leaves_no_dataset(tmp_path):
     """A recording that cannot be converted stops the command, and nothing half-written stays."""
     dump(tmp_path / "in" / "a.pkl", avoiding_recording())
@@ -256,7 +282,7 @@ def test_one_bad_recording_leaves_no_dataset(tmp_path):
 
 def test_wrong_folders_and_lists(tmp_path):
     """Wrong tasks, folders and lists are explained."""
-    with pytest.raises(ValueError, match=r"task='stacking'.*avoiding, aligning"):
+    with pytest.raises(ValueError, match=r"task='stacking'.*avoiding, unbalanced_avoiding, aligning"):
         recorded_recipe(tmp_path, "stacking")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         recorded_recipe(tmp_path / "nowhere", "avoiding")
@@ -277,5 +303,5 @@ def test_command_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", ["lerobot-swr-dataset", *arguments])
     main()
     output = capsys.readouterr().out
-    assert "1 episodes of d3il_recorded_aligning" in output
+    assert "1 episodes of d3il_human_aligning" in output
     assert "outside" in output

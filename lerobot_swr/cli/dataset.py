@@ -24,7 +24,7 @@ class DatasetCommand:
     # Which dataset: medium_maze-one_side, medium_maze-only_forward, medium_maze-only_fast or
     # medium_maze-spread_out;
     # d3il_avoiding, d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning.
-    # With from_d3il: avoiding or aligning.
+    # With from_d3il: avoiding, unbalanced_avoiding (a seeded selection of avoiding's recordings) or aligning.
     task: str
     # Folder of the new dataset.
     root: Path

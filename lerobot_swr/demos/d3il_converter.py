@@ -12,7 +12,7 @@ keeps the recorded pairs is one step staler than any that a policy meets in the 
 """
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,19 @@ from lerobot_swr.demos.d3il_aligning import ALIGNING_RECIPES
 from lerobot_swr.demos.d3il_avoiding import AVOIDING_RECIPES
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.demos.restricted_pickle import load_recording
+from lerobot_swr.envs.d3il.behavior import AVOIDING_BEHAVIORS, avoiding_behavior
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, AVOIDING_SCENE
 
-_RECIPES = {"avoiding": AVOIDING_RECIPES[0], "aligning": ALIGNING_RECIPES[0]}
+TASKS = {
+    "avoiding": AVOIDING_RECIPES[0],
+    "unbalanced_avoiding": AVOIDING_RECIPES[0],
+    "aligning": ALIGNING_RECIPES[0],
+}
+"""What ``--from_d3il`` can make, and the recipe of the scripted dataset with the same features."""
+
+UNBALANCED_COUNTS = (4,) * 6 + (3,) * 6 + (2,) * 6 + (1,) * 6
+"""Recordings kept of each of the 24 behaviours, of which the benchmark has four each; the k-th count belongs to
+behaviour 7 k mod 24, as in the scripted dataset, so that frequent ways are not neighbours."""
 
 
 def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> DatasetRecipe:
@@ -33,7 +43,8 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
 
     Args:
         folder: Holds the recordings, ``*.pkl``, directly or in subfolders.
-        task: ``avoiding`` or ``aligning``.
+        task: ``avoiding``, ``aligning`` or ``unbalanced_avoiding``, a selection of the recordings of avoiding by
+            `unbalanced`.
         file_list: A pickled list of file names in `folder` (the benchmark's train or evaluation split); by
             default all recordings, sorted by name.
 
@@ -41,24 +52,55 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
         ValueError: If the task is unknown, there is no recording, or the file list cannot be read.
         FileNotFoundError: If the folder, the list or a listed file does not exist.
     """
-    if task not in _RECIPES:
-        raise ValueError(f"task={task!r}: recordings can be converted for {', '.join(_RECIPES)}")
+    if task not in TASKS:
+        raise ValueError(f"task={task!r}: recordings can be converted for {', '.join(TASKS)}")
     if not folder.is_dir():
         raise FileNotFoundError(f"from_d3il={str(folder)!r}: no such folder")
     files = _all_recordings(folder) if file_list is None else _listed_recordings(folder, file_list)
     if not files:
         raise ValueError(f"from_d3il={str(folder)!r}: no recordings (*.pkl) in it")
 
+    if task == "unbalanced_avoiding":
+        recorded = [convert_recording(path, "avoiding") for path in files]
+        labels = [avoiding_behavior(one.observations) for one in recorded]
+        n_episodes = len(unbalanced(labels, seed=0))
+    else:
+        n_episodes = len(files)
+
     def demonstrations(seed: int) -> Iterator[Demonstration]:
+        if task == "unbalanced_avoiding":
+            return (recorded[i] for i in unbalanced(labels, seed))
         return (convert_recording(path, task) for path in files)
 
     return replace(
-        _RECIPES[task],
-        name=f"d3il_recorded_{task}",
-        n_episodes=len(files),
+        TASKS[task],
+        name=human_name(task),
+        n_episodes=n_episodes,
         demonstrations=demonstrations,
         resumable_demonstrations=None,
     )
+
+
+def human_name(task: str) -> str:
+    """What the dataset of a task's recordings is called."""
+    return f"d3il_human_{task}"
+
+
+def unbalanced(labels: Sequence[str], seed: int) -> list[int]:
+    """Which recordings of avoiding make up the unbalanced selection, in their order.
+
+    Args:
+        labels: Behaviour of each recording.
+        seed: Decides which recordings of a behaviour are kept; how many is `UNBALANCED_COUNTS`, or as many as
+            there are.
+    """
+    rng = np.random.default_rng(seed)
+    kept: list[int] = []
+    for k, count in enumerate(UNBALANCED_COUNTS):
+        behavior = AVOIDING_BEHAVIORS[7 * k % len(AVOIDING_BEHAVIORS)]
+        of_it = [i for i, label in enumerate(labels) if label == behavior]
+        kept += rng.permutation(of_it)[:count].tolist()
+    return sorted(map(int, kept))
 
 
 def _all_recordings(folder: Path) -> list[Path]:

@@ -33,6 +33,11 @@ class TaskEnvConfig(EnvConfig):
     def behavior_rule(self) -> BehaviorRule:
         """The pure rule that labels an episode of this task from its states."""
 
+    @property
+    def draws_scenes(self) -> bool:
+        """Whether every episode has a scene of its own (object poses, goal), drawn from its seed."""
+        return False
+
     def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
         """(T, 2) path of an episode, as pictures draw it: by default the first two state dimensions."""
         return observations["observation.state"][:, :2]

@@ -12,13 +12,18 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_swr.behaviors import DATASET_RULES
 from lerobot_swr.demos.catalog import RECIPES, get_recipe
+from lerobot_swr.demos.d3il_converter import human_name, recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.recipe import DatasetRecipe
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import path_of, steps_to_end
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.evaluation.length_control import frames_after_end
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.trajectories import Trajectories, load_trajectories
+
+HUMAN_DATASETS = {human_name(task): task for task in ("avoiding", "unbalanced_avoiding")}
+"""Datasets of the benchmark's human recordings to the task that `recorded_recipe` makes them of."""
 
 PATH_POINTS = 40  # of a stored path
 MAX_PATHS = 100  # stored per dataset
@@ -49,25 +54,22 @@ class Demonstrations:
         return Cell("dataset", Labels(self.name, "", ""), definition)
 
 
-def prepare(name: str, folder: Path, store: Store) -> Demonstrations:
+def prepare(name: str, folder: Path, store: Store, from_d3il: Path | None = None) -> Demonstrations:
     """Find or make a dataset, and store its description.
 
     Args:
         name: Name of the dataset.
         folder: Where datasets lie.
         store: Where the description goes.
+        from_d3il: Folder with the benchmark's human recordings of avoiding, if there is one.
 
     Raises:
         ValueError: If there is no such dataset, or its environment is not one of this package's.
     """
     root = folder / name
     if not (root / "meta" / "info.json").is_file():
-        if name not in RECIPES:
-            raise ValueError(
-                f"datasets: {name!r} is neither in {folder} nor one of the package's: {', '.join(RECIPES)}"
-            )
         print(f"making {name} in {root}", flush=True)
-        write_dataset(get_recipe(name), root, seed=0)
+        write_dataset(_recipe(name, folder, from_d3il), root, seed=0)
     meta = DatasetSource(root=root).metadata()
     if meta.robot_type not in DATASET_RULES:
         raise ValueError(
@@ -82,6 +84,21 @@ def prepare(name: str, folder: Path, store: Store) -> Demonstrations:
     if not store.is_done(demonstrations.cell):
         store.write(demonstrations.cell, _describe(trajectories, environment(demonstrations.env)), 0.0)
     return demonstrations
+
+
+def _recipe(name: str, folder: Path, from_d3il: Path | None) -> DatasetRecipe:
+    if name in HUMAN_DATASETS:
+        if from_d3il is None:
+            raise ValueError(
+                f"datasets: {name!r} is made of the D3IL benchmark's human recordings of avoiding, which are not "
+                "part of this package: give their folder with --from_d3il=FOLDER"
+            )
+        return recorded_recipe(from_d3il, HUMAN_DATASETS[name])
+    if name not in RECIPES:
+        raise ValueError(
+            f"datasets: {name!r} is neither in {folder} nor one of the package's: {', '.join(RECIPES)}"
+        )
+    return get_recipe(name)
 
 
 def load_low_dimensional(root: Path) -> Trajectories:

@@ -26,7 +26,7 @@ from lerobot_swr.reproduction.planning import (
 )
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
-from lerobot_swr.reproduction.suites import DATASETS, suite_cells
+from lerobot_swr.reproduction.suites import suite_cells, suite_datasets
 from lerobot_swr.reproduction.training import train
 
 
@@ -65,9 +65,11 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
         print(f"left out: {name} (pip install '{extra}')")
     _check_policies(settings)
     store = Store(settings.output_dir)
-    suites = {name: settings.choose_datasets(DATASETS[name]) for name in settings.suites}
+    suites = {name: settings.choose_datasets(suite_datasets(name, settings)) for name in settings.suites}
     names = dict.fromkeys(name for datasets in suites.values() for name in datasets)
-    prepared = {name: prepare(name, settings.dataset_folder, store) for name in names}
+    prepared = {
+        name: prepare(name, settings.dataset_folder, store, settings.from_d3il) for name in names
+    }
     cells: dict[Cell, Cell] = {}  # the first name of what several suites ask for
     for suite, datasets in suites.items():
         of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])

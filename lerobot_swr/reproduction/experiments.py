@@ -87,6 +87,7 @@ def evaluation(
     env: Mapping[str, Any] | None = None,
     protocols: Sequence[str] = ("uniform", "stratified"),
     style_filter: str | None = None,
+    one_scene: bool = False,
 ) -> Cell:
     """An evaluation cell on a training.
 
@@ -101,15 +102,18 @@ def evaluation(
         env: Options of the environment beyond its type and task.
         protocols: Ways of drawing styles; policies without styles are rolled out once.
         style_filter: Only styles of demonstrations that match.
+        one_scene: All rollouts of a training seed meet one scene, instead of each its own.
     """
     policy = trained.definition["policy"]
     has_styles = hasattr(PreTrainedConfig.get_choice_class(policy), "style_sampling")
     rolled_out = _rolled_out(settings, demos, env, protocols if has_styles else ("uniform",))
-    pictured = style_filter is None and rolled_out["env"] == whole_environment(demos.env)
+    as_it_is = rolled_out["env"] == whole_environment(demos.env) and not one_scene
+    pictured = style_filter is None and as_it_is
     definition = {
         **rolled_out,
         "style_filter": style_filter,
         "paths": pictured and trained == training(settings, demos, policy),
+        **({"one_scene": True} if one_scene else {}),
     }
     return Cell("evaluate", Labels(demos.name, trained.labels.policy, condition), definition, trained)
 

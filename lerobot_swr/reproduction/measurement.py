@@ -71,7 +71,8 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     count = definition["protocols"][protocol]
     env_seed = environment_seed(definition["seed"], seed)
-    rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed)
+    env_seeds = [env_seed] * count if definition.get("one_scene") else None
+    rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed, env_seeds)
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
     return {

@@ -5,7 +5,12 @@ from typing import Any
 
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
-from lerobot_swr.reproduction.demonstrations import Demonstrations, environment, whole_environment
+from lerobot_swr.reproduction.demonstrations import (
+    HUMAN_DATASETS,
+    Demonstrations,
+    environment,
+    whole_environment,
+)
 from lerobot_swr.reproduction.experiments import evaluation, playback, training
 from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
@@ -35,11 +40,19 @@ DATASETS = {
     "control": CONTROL_DATASETS,
     "figures": FIGURES_DATASETS,
 }
+# In the suites where the folder of the human recordings is given.
+HUMAN_AVOIDING, HUMAN_UNBALANCED_AVOIDING = HUMAN_DATASETS
+WITH_RECORDINGS = {
+    "table1": (HUMAN_AVOIDING, HUMAN_UNBALANCED_AVOIDING),
+    "robustness": (HUMAN_AVOIDING,),
+    "contracting": (HUMAN_AVOIDING,),
+}
 
 Conditions = dict[str, tuple[dict[str, Any], tuple[str, ...]]]
 """Name to the options of the environment and the ways of drawing styles."""
 
 UNPERTURBED = "deterministic"
+ONE_SCENE = "one scene"
 BOTH_PROTOCOLS = ("uniform", "stratified")
 
 # --- Robustness (the paper's Table 2) ---
@@ -74,6 +87,12 @@ SWEEP_PS = (0.2, 0.5, 0.8, 0.99)
 PAPER_BETA, PAPER_P = 10.0, 0.8
 
 
+def suite_datasets(suite: str, settings: ReproductionSettings) -> tuple[str, ...]:
+    """The datasets of a suite; those of human recordings come first, where their folder is given."""
+    human = WITH_RECORDINGS.get(suite, ()) if settings.from_d3il is not None else ()
+    return (*human, *DATASETS[suite])
+
+
 def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[Demonstrations]) -> list[Cell]:
     """The cells of a suite on some datasets, those that depend on a training after it."""
     build = {
@@ -89,18 +108,21 @@ def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[D
 
 def _table1(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
     for policy in settings.choose_policies(known_policies()):
-        yield evaluation(settings, demos, training(settings, demos, policy), UNPERTURBED)
+        trained = training(settings, demos, policy)
+        yield evaluation(settings, demos, trained, UNPERTURBED)
+        if environment(demos.env).draws_scenes:
+            # What the paper presumably does: its BC succeeds in all rollouts of a seed or in almost none.
+            yield evaluation(settings, demos, trained, ONE_SCENE, protocols=("uniform",), one_scene=True)
 
 
 def _robustness(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
-    if demos.env["type"] != "maze2d":
-        raise ValueError(f"datasets: {demos.name!r} is no maze; robustness perturbs mazes only")
+    conditions = _maze_conditions() if demos.env["type"] == "maze2d" else perturbations(demos)
     trained = [training(settings, demos, policy) for policy in settings.choose_policies(STACKED)]
     variants = ROBUST_WZBC if demos.name in ROBUST_WZBC_DATASETS else ()
     if "wzbc" in settings.choose_policies(STACKED):
         trained += [training(settings, demos, "wzbc", options) for options in variants]
     for one in dict.fromkeys(trained):
-        for name, (env, protocols) in _maze_conditions().items():
+        for name, (env, protocols) in conditions.items():
             yield evaluation(settings, demos, one, name, env, protocols)
     values = [{"beta": PAPER_BETA, "p": PAPER_P, **options} for options in ({}, *variants)]
     yield _similarity(demos, (), [(v["beta"], v["p"]) for v in values])

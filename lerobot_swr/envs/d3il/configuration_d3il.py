@@ -130,6 +130,11 @@ class D3ILEnvConfig(TaskEnvConfig):
         """Avoiding: the gaps taken, like ``top-mid-bottom``. Aligning: ``inside`` or ``outside``."""
         return avoiding_behavior if self.task == "avoiding" else aligning_behavior
 
+    @property
+    def draws_scenes(self) -> bool:
+        """In aligning, where box and target stand."""
+        return self.task == "aligning"
+
     def perturbations(self) -> dict[str, dict[str, Any]]:
         """Shifted starts, noisy actions and, for aligning, a pushed box."""
         found: dict[str, dict[str, Any]] = {
