@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,18 @@ class Trajectories:
         columns = {key: np.concatenate([part[key] for part in parts]) for key in self.columns}
         tasks = tuple(self.tasks[i] for i in episodes) if self.tasks else ()
         return Trajectories(self.lengths[list(episodes)], columns, self.fps, self.name, tasks)
+
+    def without(self, left_out: np.ndarray) -> "Trajectories":
+        """The same episodes without the frames marked in `left_out`, (sum of lengths,) bool.
+
+        Raises:
+            ValueError: If no frame of an episode would be left.
+        """
+        lengths = np.add.reduceat(~left_out, self.starts, dtype=np.int64)
+        if (lengths == 0).any():
+            raise ValueError(f"dataset {self.name}: nothing is left of episode {int(lengths.argmin())}")
+        columns = {key: column[~left_out] for key, column in self.columns.items()}
+        return replace(self, lengths=lengths, columns=columns)
 
     def fingerprint(self, keys: Sequence[str]) -> str:
         """Hash of the content of the features `keys` and of the episodes' lengths, in hexadecimal."""

@@ -247,7 +247,7 @@ def test_dataset_of_recordings(tmp_path):
 
 
 def test_the_unbalanced_selection_keeps_its_counts():
-    """Every behaviour stays, as often as its count says or as there are recordings; the seed chooses which."""
+    """Every behaviour stays, as often as its count says or there are recordings; the seed chooses which."""
     labels = [behavior for behavior in AVOIDING_BEHAVIORS for _ in range(4)]
     del labels[0]  # three are left of the first behaviour
     chosen = unbalanced(labels, seed=0)

@@ -11,10 +11,11 @@ from lerobot.configs.train import TrainPipelineConfig
 
 from lerobot_swr.reproduction import execution
 from lerobot_swr.reproduction.baselines import BASELINES, known_policies
+from lerobot_swr.reproduction.demonstrations import HUMAN_DATASETS
 from lerobot_swr.reproduction.experiments import evaluation, training, variant_name
 from lerobot_swr.reproduction.measurement import environment_seed
-from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, ReproductionSettings
-from lerobot_swr.reproduction.suites import suite_cells
+from lerobot_swr.reproduction.settings import MAX_ROLLOUTS, SUITES, ReproductionSettings
+from lerobot_swr.reproduction.suites import suite_cells, suite_datasets
 
 CONFIGS = Path(__file__).parent.parent / "configs"
 
@@ -62,6 +63,44 @@ def test_the_arms_tasks_are_perturbed_as_their_environment_offers(settings, demo
         assert {env["start_radius"] for env in envs} == {0.0, 0.02, 0.04}
         assert {env["action_noise"] for env in envs} == {0.0, 0.002, 0.004}
         assert {env["box_push"] for env in envs} == {0.0} | pushes
+
+
+def test_robustness_perturbs_the_arm_as_contracting_does(settings, demos):
+    """What both suites measure on zbc and wzbc is the same cell; a similarity cell tells who teaches whom."""
+    arm = dataclasses.replace(demos, env={"type": "d3il", "task": "avoiding"})
+    suites = {name: suite_cells(name, settings, [arm]) for name in ("robustness", "contracting")}
+    styled = {c for c in suites["robustness"] if c.labels.policy.split(" ")[0] in ("zbc", "wzbc")}
+    assert styled <= set(suites["contracting"])
+    assert {c.labels.policy.split(" ")[0] for c in suites["robustness"]} == {"bc", "zbc", "wzbc", ""}
+
+
+def test_aligning_is_measured_in_new_scenes_and_in_one(settings, demos):
+    """Table 1 has both protocols where every episode draws a scene, and one where none does."""
+    settings = dataclasses.replace(settings, policies=["bc", "zbc"])
+    for task, expected in (("avoiding", ["deterministic"]), ("aligning", ["deterministic", "one scene"])):
+        arm = dataclasses.replace(demos, env={"type": "d3il", "task": task})
+        cells = [c for c in suite_cells("table1", settings, [arm]) if c.kind == "evaluate"]
+        for policy in ("bc hidden_dim=16", "zbc hidden_dim=16"):
+            of_it = [c for c in cells if c.labels.policy == policy]
+            assert [c.labels.condition for c in of_it] == expected
+            assert [c.definition.get("one_scene", False) for c in of_it] == [False, True][: len(expected)]
+
+
+def test_human_recordings_join_where_their_folder_is_given(tmp_path):
+    """First in table1, robustness and contracting; without the folder no suite has them."""
+    without, given = (ReproductionSettings(from_d3il=folder) for folder in (None, tmp_path))
+    for suite in SUITES:
+        assert not set(suite_datasets(suite, without)) & set(HUMAN_DATASETS)
+    assert suite_datasets("table1", given)[:2] == tuple(HUMAN_DATASETS)
+    assert suite_datasets("robustness", given)[0] == suite_datasets("contracting", given)[0]
+    assert suite_datasets("control", given) == suite_datasets("control", without)
+
+
+def test_human_datasets_ask_for_their_folder(tmp_path):
+    """The recordings are not part of the package."""
+    wanted = ReproductionSettings(suite="table1", datasets=["d3il_human_avoiding"], output_dir=tmp_path)
+    with pytest.raises(ValueError, match=r"'d3il_human_avoiding' is made of .* --from_d3il=FOLDER"):
+        execution.reproduce(wanted)
 
 
 def test_every_style_is_used_equally_often(settings, demos):

@@ -34,8 +34,8 @@ TASKS = {
 """What ``--from_d3il`` can make, and the recipe of the scripted dataset with the same features."""
 
 UNBALANCED_COUNTS = (4,) * 6 + (3,) * 6 + (2,) * 6 + (1,) * 6
-"""Recordings kept of each of the 24 behaviours, of which the benchmark has four each; the k-th count belongs to
-behaviour 7 k mod 24, as in the scripted dataset, so that frequent ways are not neighbours."""
+"""Recordings kept of each of the 24 behaviours, of which the benchmark has four each; the k-th count belongs
+to behaviour 7 k mod 24, as in the scripted dataset, so that frequent ways are not neighbours."""
 
 
 def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> DatasetRecipe:
@@ -43,8 +43,8 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
 
     Args:
         folder: Holds the recordings, ``*.pkl``, directly or in subfolders.
-        task: ``avoiding``, ``aligning`` or ``unbalanced_avoiding``, a selection of the recordings of avoiding by
-            `unbalanced`.
+        task: ``avoiding``, ``aligning`` or ``unbalanced_avoiding``, a selection (`unbalanced`) of the
+            recordings of avoiding.
         file_list: A pickled list of file names in `folder` (the benchmark's train or evaluation split); by
             default all recordings, sorted by name.
 

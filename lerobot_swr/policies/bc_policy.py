@@ -33,6 +33,10 @@ class BCPolicy(DatasetPolicy):
         super().__init__(config, dataset_meta)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
+        self._is_pause: Tensor | None = None
+        if self.pauses is not None:
+            self._is_pause = torch.from_numpy(self.pauses)
+            self._starts = torch.from_numpy(self.trajectories.starts)
 
     @property
     def _style_dim(self) -> int:
@@ -51,11 +55,17 @@ class BCPolicy(DatasetPolicy):
         )
 
     def _balance_weights(self) -> Tensor | None:
-        """(N,) mean length / length of each episode: uniform frames become uniform episodes."""
-        if not self.config.balance_episodes or self._trajectories is None:
+        """(N,) factors of the loss of each episode's frames, pauses left out; their mean over all frames is 1.
+
+        Mean length / length of each episode: uniform frames become uniform episodes.
+        """
+        if self._trajectories is None or not (self.config.balance_episodes or self.pauses is not None):
             return None
         lengths = torch.from_numpy(self._trajectories.lengths).to(torch.float32)
-        return lengths.mean() / lengths
+        kept = torch.from_numpy(self.moving_trajectories.lengths).to(torch.float32)
+        if not self.config.balance_episodes:
+            return (lengths.sum() / kept.sum()).expand(len(lengths))
+        return lengths.mean() / kept
 
     # --- LeRobot's training interface ---
 
@@ -82,21 +92,28 @@ class BCPolicy(DatasetPolicy):
         """What the loss of a batch is computed from, all random draws and bookkeeping included.
 
         Args:
-            batch: As in `forward`; the frames of consecutive steps may come together, one after the other.
+            batch: As in `forward`, and each frame's ``timestamp`` (B,) in seconds where the dataset has pauses;
+                the frames of consecutive steps may come together, one after the other.
             steps: Number of steps whose frames these are, as many of each.
 
         Returns:
             Observations (B, d_k), ``action`` (B, A) and ``weight`` (B,), the factor of each frame's loss.
         """
         keys = [*self.config.observation_keys, ACTION]
-        return {**{key: batch[key] for key in keys}, "weight": self.frame_weights(batch["episode_index"])}
+        return {**{key: batch[key] for key in keys}, "weight": self.frame_weights(batch)}
 
-    def frame_weights(self, episodes: Tensor) -> Tensor:
-        """(B,) factors that let uniformly drawn frames of the (B,) `episodes` count every episode alike."""
+    def frame_weights(self, batch: dict[str, Tensor]) -> Tensor:
+        """(B,) factors that let uniformly drawn frames count every episode alike, and pauses not at all."""
+        episodes = batch["episode_index"]
         if self._episode_weights is None:
             return torch.ones(len(episodes), device=episodes.device)
         self._episode_weights = self._episode_weights.to(episodes.device)
-        return self._episode_weights[episodes]
+        weights = self._episode_weights[episodes]
+        if self._is_pause is None:
+            return weights
+        self._is_pause, self._starts = self._is_pause.to(episodes.device), self._starts.to(episodes.device)
+        frames = (batch["timestamp"].flatten() * self.trajectories.fps).round().to(torch.int64)
+        return weights * ~self._is_pause[self._starts[episodes] + frames]
 
     def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B,) weighted loss of each frame; a pure function of the parameters and of what `draw` returned."""

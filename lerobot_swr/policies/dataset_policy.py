@@ -1,5 +1,6 @@
 """What policies that look at their whole training dataset share: reading it, telling it from another."""
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_swr.configuration import is_resuming
+from lerobot_swr.pauses import pause_frames
 from lerobot_swr.policies.configuration_swr import BCConfig
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors, with_unit_std_where_constant
 from lerobot_swr.policies.state_policy import StatePolicy
@@ -16,6 +18,8 @@ from lerobot_swr.sampling import StepGenerator
 from lerobot_swr.style_encoding import Frames
 from lerobot_swr.style_table import OUTCOMES
 from lerobot_swr.trajectories import Trajectories, load_trajectories
+
+logger = logging.getLogger(__name__)
 
 
 class DatasetPolicy(StatePolicy):
@@ -33,6 +37,7 @@ class DatasetPolicy(StatePolicy):
     config_class = BCConfig
     name = "dataset"  # LeRobot wants one of every class; policies have their own
     config: BCConfig
+    pauses: np.ndarray | None = None  # (F,) bool, which frames of the training dataset are left out, if any
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None):
         super().__init__(config)
@@ -59,6 +64,18 @@ class DatasetPolicy(StatePolicy):
                 "original dataset, or fine-tune on this one with --policy.path instead of --resume"
             )
         config.num_episodes, config.dataset_fingerprint = len(self._trajectories), fingerprint
+        if config.skip_pauses:
+            self._find_pauses()
+
+    def _find_pauses(self) -> None:
+        pauses = pause_frames(self.trajectories, self.config.observation_keys, ACTION)
+        if pauses.any():
+            logger.info(
+                "%.1f %% of the frames are pauses before a movement, which a policy without memory cannot "
+                "learn: left out (policy.skip_pauses=false keeps them)",
+                100 * pauses.mean(),
+            )
+            self.pauses = pauses
 
     def read_demonstrations(self, meta: LeRobotDatasetMetadata) -> Trajectories:
         """What a policy like this one takes from a dataset: observations, actions and, if any, outcomes."""
@@ -75,6 +92,11 @@ class DatasetPolicy(StatePolicy):
         if self._trajectories is None:
             raise RuntimeError("this needs the training dataset: create the policy with dataset_meta")
         return self._trajectories
+
+    @property
+    def moving_trajectories(self) -> Trajectories:
+        """The training dataset without the frames that are left out."""
+        return self.trajectories if self.pauses is None else self.trajectories.without(self.pauses)
 
     def normalized_frames(self, episode: int, frames: np.ndarray) -> Frames:
         """Some frames of an episode of the training dataset, as batches bring them."""

@@ -61,7 +61,10 @@ class ZBCPolicy(BCPolicy):
             self.corrections = Corrections(config)
         if self.corrections is not None and self._dynamics is not None:
             stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
-            self.corrections.adopt_dataset(config, self._dynamics, stats, self._episode_weights)
+            weights = self._episode_weights
+            if weights is not None and self.pauses is not None:
+                weights = weights * float((~self.pauses).mean())  # corrective frames come from the others alone
+            self.corrections.adopt_dataset(config, self._dynamics, stats, weights)
         if dataset_meta is not None:
             self.styles.table = self.make_table(self.trajectories, dataset_meta)
 
@@ -170,7 +173,7 @@ class ZBCPolicy(BCPolicy):
         super()._adopt_dataset(meta)
         if self._new_dataset:
             self.config.num_added_styles = 0
-        self._dynamics = describe_dynamics(self.config, meta, self.trajectories, from_checkpoint)
+        self._dynamics = describe_dynamics(self.config, meta, self.moving_trajectories, from_checkpoint)
 
     @classmethod
     def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]

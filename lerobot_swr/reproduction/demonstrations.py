@@ -90,8 +90,8 @@ def _recipe(name: str, folder: Path, from_d3il: Path | None) -> DatasetRecipe:
     if name in HUMAN_DATASETS:
         if from_d3il is None:
             raise ValueError(
-                f"datasets: {name!r} is made of the D3IL benchmark's human recordings of avoiding, which are not "
-                "part of this package: give their folder with --from_d3il=FOLDER"
+                f"datasets: {name!r} is made of the D3IL benchmark's human recordings of avoiding, which are "
+                "not part of this package: give their folder with --from_d3il=FOLDER"
             )
         return recorded_recipe(from_d3il, HUMAN_DATASETS[name])
     if name not in RECIPES:

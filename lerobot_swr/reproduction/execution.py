@@ -67,9 +67,7 @@ def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure
     store = Store(settings.output_dir)
     suites = {name: settings.choose_datasets(suite_datasets(name, settings)) for name in settings.suites}
     names = dict.fromkeys(name for datasets in suites.values() for name in datasets)
-    prepared = {
-        name: prepare(name, settings.dataset_folder, store, settings.from_d3il) for name in names
-    }
+    prepared = {name: prepare(name, settings.dataset_folder, store, settings.from_d3il) for name in names}
     cells: dict[Cell, Cell] = {}  # the first name of what several suites ask for
     for suite, datasets in suites.items():
         of_suite = suite_cells(suite, settings, [prepared[name] for name in datasets])

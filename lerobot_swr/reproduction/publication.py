@@ -3,13 +3,15 @@
 import shutil
 from pathlib import Path
 
-from lerobot_swr.reproduction import figures, tables
+from lerobot_swr.reproduction import figures, paper, tables
 from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.stored_results import StoredCell, load_suites
+from lerobot_swr.reproduction.suites import UNPERTURBED
 
 START, END = "<!-- results: written by lerobot-swr-report -->", "<!-- end of results -->"
 PICTURE = "result.png"
-PICTURED = ("medium_maze-only_forward", "wzbc")
+PICTURED = (("d3il_human_avoiding", "zbc"), ("medium_maze-only_forward", "wzbc"))
+"""Dataset and policy of README's picture; the first one whose results are there."""
 
 
 def publish(source: Path, target: Path) -> None:
@@ -55,8 +57,10 @@ def readme_block(root: Path) -> str:
         "L1 uniform (floor)",
         "success",
         "style fidelity",
+        "the paper's L1, success",
     )
-    rows = [_readme_row(cell) for name in suite.datasets for cell in suite.evaluations(name)]
+    cells = [cell for name in suite.datasets for cell in suite.evaluations(name)]
+    rows = [_readme_row(cell) for cell in cells if cell.labels.condition == UNPERTURBED]
     lines = [header, ("---",) * len(header), *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
@@ -69,10 +73,11 @@ def update_readme(readme: Path, root: Path) -> None:
     """
     write_text(readme, with_block(readme.read_text(encoding="utf-8"), readme_block(root), readme))
     suite = load_suites(root)["table1"]
-    dataset, policy = PICTURED
-    pictured = [cell for cell in suite.evaluations(dataset) if cell.policy == policy]
-    if pictured:
-        figures.plot_result(root / PICTURE, suite.datasets[dataset], pictured[0])
+    for dataset, policy in PICTURED:
+        pictured = [cell for cell in suite.evaluations(dataset) if cell.policy == policy]
+        if pictured:
+            figures.plot_result(root / PICTURE, suite.datasets[dataset], pictured[0])
+            return
 
 
 def with_block(text: str, block: str, readme: Path) -> str:
@@ -89,7 +94,7 @@ def _readme_row(cell: StoredCell) -> tuple[str, ...]:
     success, fidelity = cell.best.success, cell.best.fidelity
     assert cell.training is not None
     return (
-        cell.labels.dataset.removeprefix("medium_maze-"),
+        cell.labels.dataset.removeprefix("medium_maze-").removeprefix("d3il_"),
         cell.labels.policy,
         f"{cell.training['steps']:,}",
         tables.rollouts(uniform),
@@ -97,4 +102,5 @@ def _readme_row(cell: StoredCell) -> tuple[str, ...]:
         f"{uniform.l1:.3f} ({tables.floor(uniform)})".replace("\n", " "),
         f"{success.mean:.3f} {tables.bracket(success.interval)}",
         tables.NOTHING if fidelity is None else f"{fidelity.mean:.3f}",
+        tables.quoted(paper.table1(cell.labels.dataset, cell.policy)).replace("\n", " "),
     )

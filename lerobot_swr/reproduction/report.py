@@ -17,6 +17,7 @@ from lerobot_swr.reproduction.stored_results import (
     SuiteResults,
     load_suites,
 )
+from lerobot_swr.reproduction.suites import UNPERTURBED
 
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
@@ -71,13 +72,15 @@ def write_results_report(root: Path) -> Path:
 
 
 def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    yield Section("Table 1", tables.whole_table1(suite), [])
     for name, demonstrations in suite.datasets.items():
         cells = suite.evaluations(name)
         if not cells:
             continue
         paths, histograms = pictures / f"paths-{name}.png", pictures / f"histograms-{name}.png"
-        figures.plot_paths(paths, demonstrations, cells)
-        figures.plot_histograms(histograms, demonstrations, cells)
+        usual = [cell for cell in cells if cell.labels.condition == UNPERTURBED]
+        figures.plot_paths(paths, demonstrations, usual)
+        figures.plot_histograms(histograms, demonstrations, usual)
         yield Section(
             f"Diversity: {name}",
             [tables.table1(suite, name)],

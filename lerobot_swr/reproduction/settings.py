@@ -34,8 +34,8 @@ class ReproductionSettings:
     baseline_seeds: int = 2
     # Only these datasets; null takes the paper's. A suite that is named takes datasets of your own as well.
     datasets: list[str] | None = None
-    # Folder with the D3IL benchmark's human recordings of avoiding (*.pkl): adds the datasets d3il_human_avoiding
-    # and d3il_human_unbalanced_avoiding, which are made of them.
+    # Folder with the D3IL benchmark's human recordings of avoiding (*.pkl): adds the datasets
+    # d3il_human_avoiding and d3il_human_unbalanced_avoiding, which are made of them.
     from_d3il: Path | None = None
     # Only these policies.
     policies: list[str] | None = None

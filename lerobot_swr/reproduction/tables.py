@@ -1,13 +1,15 @@
 """Tables of the report, from summaries."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+
+import numpy as np
 
 from lerobot_swr.evaluation.length_control import BIN_WIDTH, TOLERANCE
 from lerobot_swr.evaluation.metrics import Interval
 from lerobot_swr.evaluation.report import Table
 from lerobot_swr.reproduction import paper
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
-from lerobot_swr.reproduction.suites import CONDITIONS, LENGTH_BAND
+from lerobot_swr.reproduction.suites import CONDITIONS, LENGTH_BAND, ONE_SCENE, UNPERTURBED
 from lerobot_swr.reproduction.summary import Rate, Summary, difference_interval, length_control
 
 NOTHING = "–"
@@ -20,9 +22,35 @@ INTERVALS = (
 )
 
 
+SCENES = (
+    f"{ONE_SCENE}: all rollouts of a training seed start with box and target in one place, that of its "
+    "first rollout; otherwise every rollout has places of its own. The paper does not say which it does; that "
+    "its BC succeeds in all rollouts of one seed and in almost none of the others fits one scene."
+)
+IN_MAZES = (
+    "pseudo-random start: uniform in ± 0.10 of the side around the start; random start: anywhere; transition "
+    "noise: on every step, with a standard deviation of the largest step (0.02 of the side). Style match: "
+    "rollouts with the behaviour of the demonstration whose style they use, of its doors those ahead of the "
+    "start; L1 counts all doors, so it cannot be small from random starts. The paper's figures are of its own "
+    "maze and perturbations."
+)
+ON_THE_ARM = (
+    "start: the tool starts anywhere in a square of that half-width; action noise: standard deviation on "
+    "each coordinate of every action. Style match: rollouts with the behaviour of the demonstration whose "
+    "style they use. The paper perturbs mazes only."
+)
+
+
 def quoted(figures: paper.Quoted | None) -> str:
     """The paper's L1 and success, or a dash."""
-    return NOTHING if figures is None else f"{figures.l1:.3f},\n{figures.success:.3f}"
+    if figures is None:
+        return NOTHING
+    return f"{deviating(figures.l1)},\n{deviating(figures.success)}"
+
+
+def deviating(figure: paper.Deviating) -> str:
+    """Mean and standard deviation over training seeds."""
+    return f"{figure[0]:.3f} ± {figure[1]:.3f}"
 
 
 def bracket(interval: Interval) -> str:
@@ -69,7 +97,7 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
         uniform, stratified = cell.summaries["uniform"], cell.summaries.get("stratified")
         rows.append(
             (
-                cell.labels.policy,
+                named(cell),
                 steps(cell),
                 rollouts(uniform),
                 l1(uniform),
@@ -77,7 +105,7 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
                 l1(stratified),
                 NOTHING if stratified is None else f"{stratified.floor.mean:.3f}",
                 share(cell.best.success),
-                quoted(paper.TABLE1.get((dataset, cell.policy))),
+                quoted(paper.table1(dataset, cell.policy)),
                 share(cell.best.fidelity),
                 f"{cell.best.coverage:.3f}",
             )
@@ -101,16 +129,59 @@ def table1(suite: SuiteResults, dataset: str) -> Table:
         f"behaviours. {INTERVALS} Success, fidelity and coverage are those of the stratified rollouts, where "
         "the policy has styles."
     )
+    if any(cell.labels.condition == ONE_SCENE for cell in suite.evaluations(dataset)):
+        caption += f" {SCENES}"
     return Table(caption, header, rows)
+
+
+def named(cell: StoredCell) -> str:
+    """A policy's name, and the condition where it is not the usual one."""
+    usual = cell.labels.condition == UNPERTURBED
+    return cell.labels.policy if usual else f"{cell.labels.policy},\n{cell.labels.condition}"
+
+
+def whole_table1(suite: SuiteResults) -> list[Table]:
+    """The paper's Table 1 as it stands there, ours and the paper's figures one above the other."""
+    measures: dict[str, tuple[Callable[[Summary], list[float]], int]] = {
+        "L1 of the behaviour histograms": (lambda summary: summary.l1_by_seed, 0),
+        "Success": (lambda summary: summary.success.by_seed, 1),
+    }
+    return [_whole(suite, what, by_seed, place) for what, (by_seed, place) in measures.items()]
+
+
+def _whole(suite: SuiteResults, what: str, by_seed: Callable[[Summary], list[float]], place: int) -> Table:
+    rows = []
+    for dataset in suite.datasets:
+        cells = {(c.labels.condition, c.policy): c for c in suite.evaluations(dataset)}
+        for condition in dict.fromkeys(condition for condition, _ in cells):
+            row = [dataset if condition == UNPERTURBED else f"{dataset},\n{condition}"]
+            for policy in paper.POLICIES:
+                cell, theirs = cells.get((condition, policy)), paper.table1(dataset, policy)
+                ours = NOTHING
+                if cell is not None:
+                    values = by_seed(cell.summaries["uniform"])
+                    ours = deviating((float(np.mean(values)), float(np.std(values))))
+                row.append(f"{ours}\n{NOTHING if theirs is None else deviating(theirs[place])}")
+            rows.append(tuple(row))
+    caption = (
+        f"{what}, styles drawn uniformly: ours, and below it the paper's; mean ± standard deviation over "
+        "training seeds (of those that were trained, as the paper's are). Only the human recordings of "
+        "avoiding are data that both have."
+    )
+    if any(cell.labels.condition == ONE_SCENE for cell in suite.cells):
+        caption += f" {SCENES}"
+    return Table(caption, ("dataset", *paper.POLICIES), rows)
 
 
 def robustness(suite: SuiteResults, dataset: str) -> Table:
     """Perturbed starts and transitions: the paper's Table 2."""
     rows: list[tuple[str, ...]] = []
-    for condition in CONDITIONS:
+    in_maze = suite.datasets[dataset].env["type"] == "maze2d"
+    found = dict.fromkeys(cell.labels.condition for cell in suite.evaluations(dataset))
+    for condition in CONDITIONS if in_maze else found:
         for cell in suite.evaluations(dataset):
             if cell.labels.condition == condition:
-                summary, uniform = cell.best, cell.summaries["uniform"]
+                summary, uniform = cell.best, cell.summaries.get("uniform")
                 styled = "stratified" in cell.summaries
                 rows.append(
                     (
@@ -136,13 +207,7 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         "floor",
         "paper's L1,\nsuccess",
     )
-    caption = (
-        f"{dataset}. pseudo-random start: uniform in ± 0.10 of the side around the start; random start: "
-        "anywhere; transition noise: on every step, with a standard deviation of the largest step (0.02 of "
-        f"the side). {INTERVALS} Style match: rollouts with the behaviour of the demonstration whose style "
-        "they use, of its doors those ahead of the start; L1 counts all doors, so it cannot be small from "
-        "random starts. The paper's figures are of its own maze and perturbations."
-    )
+    caption = f"{dataset}. {IN_MAZES if in_maze else ON_THE_ARM} {INTERVALS}"
     return Table(caption, header, rows)
 
 

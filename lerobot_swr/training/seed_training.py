@@ -170,8 +170,10 @@ def _prepared_frames(runs: SeedRuns) -> dict[str, Tensor]:
     episodes = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
     prepared = runs.preprocessor(raw)
     frames = {key: prepared[key] for key in keys}
-    device = frames[ACTION].device
-    return {**frames, "episode_index": episodes.to(device), "index": torch.arange(len(episodes)).to(device)}
+    device, rows = frames[ACTION].device, torch.arange(len(episodes))
+    places = rows - torch.from_numpy(policy.trajectories.starts)[episodes]
+    frames["timestamp"] = (places / policy.trajectories.fps).to(device)
+    return {**frames, "episode_index": episodes.to(device), "index": rows.to(device)}
 
 
 def _draw(
