@@ -194,7 +194,7 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     keep_only("table1", finished)
     write_results_report(finished)
     write_text(target / "results" / "stale.json", "{}")
-    publish(finished, target)
+    publish([finished], target)
     assert not (target / "work").exists()
     assert not (target / "results" / "stale.json").exists()
     pages = [
@@ -203,10 +203,31 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     assert pages[0] == pages[1]
 
 
+def test_several_folders_are_published_as_one(finished, tmp_path, run_command):
+    """The first folder's finished results win; what it lacks comes from the next one, by what it is."""
+    keep_only("table1", finished)
+    more, target = tmp_path / "more", tmp_path / "published"
+    shutil.copytree(finished, more)
+    lost = next((finished / "results").glob("evaluate-*-zbc-deterministic-*.json"))
+    kept = next((finished / "results").glob("evaluate-*-wzbc-deterministic-*.json"))
+    lost.unlink()
+    (more / "results" / kept.name).write_text(kept.read_text().replace('"success":[1', '"success":[0'))
+    for file in (more / "results").glob("evaluate-*-zbc-deterministic-*.json"):  # another key
+        renamed = file.with_name(file.name.replace("deterministic-", "deterministic-a"))
+        file.rename(renamed)
+        manifest = more / "suites" / "table1.json"
+        manifest.write_text(manifest.read_text().replace(file.name, renamed.name))
+    run_command(report_command, finished, more, f"--publish={target}", "--suites=[table1]")
+    suite = load_suites(target)["table1"]
+    assert not suite.missing
+    assert (target / "results" / kept.name).read_text() == kept.read_text()
+    assert {c.policy for c in suite.evaluations("small_maze")} >= {"bc", "zbc", "wzbc"}
+
+
 def test_results_are_not_published_over_themselves(finished):
     """Publishing replaces the target's results, so the source is refused as the target."""
     with pytest.raises(ValueError, match=r"is the folder of the results itself"):
-        publish(finished, finished / ".." / finished.name)
+        publish([finished], finished / ".." / finished.name)
     assert list((finished / "results").iterdir())
 
 
@@ -230,7 +251,7 @@ def test_a_readme_without_markers_is_refused(finished, tmp_path):
 
 def test_the_readme_shows_the_published_results():
     """README's block is what the stored results give: neither stands without the other."""
-    published = REPOSITORY / "docs" / "results" / "maze"
+    published = REPOSITORY / "docs" / "results" / "human"
     text = (REPOSITORY / "README.md").read_text()
     assert (START in text) == published.is_dir()
     if published.is_dir():

@@ -3,9 +3,12 @@
 Examples:
     lerobot-swr-report outputs/reproduction
     lerobot-swr-report outputs/reproduction --publish=docs/results/maze
+    lerobot-swr-report docs/results/human docs/results/maze --publish=outputs/all --suites='[table1]'
     lerobot-swr-report docs/results/maze --readme=README.md
 """
 
+import itertools
+import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,10 +24,13 @@ from lerobot_swr.reproduction.report import write_results_report
 class ReportCommand:
     """Options of ``lerobot-swr-report``."""
 
-    # Folder with the stored results; also the first argument.
-    results: Path
+    # Folders with stored results; also the first arguments. Of several, the report is that of all together,
+    # written where `publish` says.
+    results: list[Path]
     # Copy the stored results (no checkpoints) to this folder, and write the report there.
     publish: Path | None = None
+    # With publish: only these suites; null takes all.
+    suites: list[str] | None = None
     # Write the table of results into this file, between its markers.
     readme: Path | None = None
 
@@ -32,10 +38,15 @@ class ReportCommand:
 @parser.wrap()
 def report(cfg: ReportCommand) -> None:
     """Write the report."""
-    root = cfg.results
+    root = cfg.results[0]
     if cfg.publish is not None:
-        publish(cfg.results, cfg.publish)
+        publish(cfg.results, cfg.publish, cfg.suites)
         root = cfg.publish
+    elif len(cfg.results) > 1 or cfg.suites is not None:
+        raise ValueError(
+            "publish is missing: several folders, or some suites of one, are copied together before their "
+            "report is written; say where with --publish=FOLDER"
+        )
     print(f"report: {write_results_report(root)}")
     if cfg.readme is not None:
         update_readme(cfg.readme, root)
@@ -45,6 +56,7 @@ def report(cfg: ReportCommand) -> None:
 @explain_errors
 def main() -> None:
     """Entry point."""
-    if len(sys.argv) > 1 and not sys.argv[1].startswith("-"):
-        sys.argv[1] = f"--results={sys.argv[1]}"
+    folders = list(itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:]))
+    if folders:
+        sys.argv[1 : 1 + len(folders)] = [f"--results={json.dumps(folders)}"]
     report()

@@ -55,9 +55,10 @@ class BCPolicy(DatasetPolicy):
         )
 
     def _balance_weights(self) -> Tensor | None:
-        """(N,) factors of the loss of each episode's frames, pauses left out; their mean over all frames is 1.
+        """(N,) factors of the loss of each episode's frames, pauses left out; None for 1.
 
-        Mean length / length of each episode: uniform frames become uniform episodes.
+        Mean length / length of each episode: uniform frames become uniform episodes. Where pauses count 0,
+        the mean over all frames is 1.
         """
         if self._trajectories is None or not (self.config.balance_episodes or self.pauses is not None):
             return None
@@ -77,7 +78,8 @@ class BCPolicy(DatasetPolicy):
         """Training loss of a batch of frames: `draw`, then `frame_losses`.
 
         Args:
-            batch: Normalised observations (B, d), ``action`` (B, A) and ``episode_index`` (B,).
+            batch: Normalised observations (B, d), ``action`` (B, A), ``episode_index`` (B,) and, where the
+                dataset has pauses, ``timestamp`` (B,) in seconds.
             reduction: ``mean``, or ``none`` for one loss per frame.
 
         Returns:
@@ -92,8 +94,7 @@ class BCPolicy(DatasetPolicy):
         """What the loss of a batch is computed from, all random draws and bookkeeping included.
 
         Args:
-            batch: As in `forward`, and each frame's ``timestamp`` (B,) in seconds where the dataset has pauses;
-                the frames of consecutive steps may come together, one after the other.
+            batch: As in `forward`; the frames of consecutive steps may come together, one after the other.
             steps: Number of steps whose frames these are, as many of each.
 
         Returns:

@@ -39,8 +39,8 @@ class BCConfig(StateConfig):
     # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
     # uniformly, which favours long episodes).
     balance_episodes: bool = True
-    # Leave out the frames in which a demonstrator pauses before moving on. A policy without memory cannot wait:
-    # it would learn to creep there.
+    # Leave out the frames in which a demonstrator pauses before moving on. A policy without memory cannot
+    # wait: it would learn to creep there. Deviates from the paper where demonstrations have pauses.
     skip_pauses: bool = True
 
     # --- Set from the dataset; not meant to be given ---

@@ -63,7 +63,9 @@ class ZBCPolicy(BCPolicy):
             stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
             weights = self._episode_weights
             if weights is not None and self.pauses is not None:
-                weights = weights * float((~self.pauses).mean())  # corrective frames come from the others alone
+                weights = weights * float(
+                    (~self.pauses).mean()
+                )  # corrective frames come from the others alone
             self.corrections.adopt_dataset(config, self._dynamics, stats, weights)
         if dataset_meta is not None:
             self.styles.table = self.make_table(self.trajectories, dataset_meta)

@@ -1,7 +1,10 @@
 """Published results: the small files alone, and the README's table made from them."""
 
+import json
 import shutil
+from collections.abc import Container, Sequence
 from pathlib import Path
+from typing import Any
 
 from lerobot_swr.reproduction import figures, paper, tables
 from lerobot_swr.reproduction.cells import write_text
@@ -14,25 +17,62 @@ PICTURED = (("d3il_human_avoiding", "zbc"), ("medium_maze-only_forward", "wzbc")
 """Dataset and policy of README's picture; the first one whose results are there."""
 
 
-def publish(source: Path, target: Path) -> None:
-    """Copy the stored results, without checkpoints and logs.
+def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = None) -> None:
+    """Copy the stored results of one folder or several, without checkpoints and logs.
 
-    Only what the suites' last runs consist of is copied; results in the target that they do not have go.
+    Only what the suites' last runs consist of is copied; results in the target that they do not have go. Of a
+    dataset, policy and condition that several folders have, the first one's finished result is taken.
+
+    Args:
+        sources: Folders of results.
+        target: Where to.
+        only: Names of the suites to copy; None copies all.
 
     Raises:
-        FileNotFoundError: If the source has no results.
-        ValueError: If source and target are the same folder.
+        FileNotFoundError: If a source has no results.
+        ValueError: If a source and the target are the same folder, or no suite is left.
     """
-    if source.resolve() == target.resolve():
+    if target.resolve() in [source.resolve() for source in sources]:
         raise ValueError(f"publish={str(target)!r}: is the folder of the results itself; choose another one")
-    suites = load_suites(source)
+    manifests: dict[str, dict[str, Any]] = {}
+    origin: dict[str, Path] = {}
+    for source in sources:
+        for name, suite in load_suites(source).items():
+            if only is None or name in only:
+                manifest = json.loads((source / "suites" / f"{name}.json").read_text())
+                origin = {**{file: source / "results" / file for file in suite.files}, **origin}
+                manifests[name] = _merged(manifests.get(name), manifest, origin)
+    if not manifests:
+        raise ValueError(f"suites={list(only or [])}: none of them is in {', '.join(map(str, sources))}")
     for folder in ("results", "suites"):
         shutil.rmtree(target / folder, ignore_errors=True)
         (target / folder).mkdir(parents=True)
-    for suite in suites.values():
-        shutil.copy(source / "suites" / f"{suite.name}.json", target / "suites")
-        for file in suite.files:
-            shutil.copy(source / "results" / file, target / "results")
+    for name, manifest in manifests.items():
+        write_text(target / "suites" / f"{name}.json", json.dumps(manifest, indent=1) + "\n")
+        for file in (*manifest["datasets"].values(), *manifest["cells"]):
+            if file in origin:  # others are not finished
+                shutil.copy(origin[file], target / "results")
+
+
+def _merged(first: dict[str, Any] | None, second: dict[str, Any], finished: Container[str]) -> dict[str, Any]:
+    """A suite's manifest from two folders' ones."""
+    if first is None:
+        return second
+
+    def what(file: str) -> str:
+        """Kind, dataset, policy and condition, without the cell's key."""
+        return file.rpartition("-")[0]
+
+    cells = {what(file): file for file in first["cells"]}
+    for file in second["cells"]:
+        if cells.get(what(file)) not in finished:
+            cells[what(file)] = file
+    return {
+        **first,
+        "command": "\n".join(dict.fromkeys([*first["command"].split("\n"), second["command"]])),
+        "datasets": {**second["datasets"], **first["datasets"]},
+        "cells": list(cells.values()),
+    }
 
 
 def readme_block(root: Path) -> str:

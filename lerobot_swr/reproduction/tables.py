@@ -24,15 +24,15 @@ INTERVALS = (
 
 SCENES = (
     f"{ONE_SCENE}: all rollouts of a training seed start with box and target in one place, that of its "
-    "first rollout; otherwise every rollout has places of its own. The paper does not say which it does; that "
-    "its BC succeeds in all rollouts of one seed and in almost none of the others fits one scene."
+    "first rollout; otherwise every rollout has places of its own. The paper does not say which it does; its "
+    "BC, which succeeds in all rollouts of one seed and in almost none of the others, fits one scene."
 )
 IN_MAZES = (
     "pseudo-random start: uniform in ± 0.10 of the side around the start; random start: anywhere; transition "
     "noise: on every step, with a standard deviation of the largest step (0.02 of the side). Style match: "
     "rollouts with the behaviour of the demonstration whose style they use, of its doors those ahead of the "
-    "start; L1 counts all doors, so it cannot be small from random starts. The paper's figures are of its own "
-    "maze and perturbations."
+    "start; L1 counts all doors, so it cannot be small from random starts. The paper's figures are of its "
+    "own maze and perturbations."
 )
 ON_THE_ARM = (
     "start: the tool starts anywhere in a square of that half-width; action noise: standard deviation on "
