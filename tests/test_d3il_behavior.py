@@ -18,6 +18,8 @@ from lerobot_swr.envs.d3il.behavior import (
     mode_bits,
     rotation_distance,
 )
+from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
+from lerobot_swr.envs.d3il.layouts import FINISH_LINE_Y
 
 
 def benchmark_bits(path):
@@ -117,3 +119,16 @@ def test_rotation_distance_is_the_angle_between(first, second):
     a, b = (np.array([math.cos(t / 2), 0, 0, math.sin(t / 2)]) for t in (first, second))
     difference = abs((first - second + math.pi) % (2 * math.pi) - math.pi)
     assert rotation_distance(a, b) == pytest.approx(difference, abs=1e-6)
+
+
+def test_a_demonstration_ends_where_the_environment_would():
+    """Recordings that run on behind the finish line, or with the box in its place, are not longer for that."""
+    path = np.zeros((8, 4), np.float32)
+    path[:, 3] = [-0.28, 0.0, 0.2, FINISH_LINE_Y, 0.36, 0.3, 0.37, 0.4]
+    avoiding = D3ILEnvConfig(task="avoiding")
+    assert avoiding.steps_to_end({"observation.state": path}) == 4
+    assert avoiding.steps_to_end({"observation.state": path[:4]}) == 4
+    scene = np.zeros((5, 14), np.float32)
+    scene[:, [3, 10]] = 1  # unturned
+    scene[:, 0] = [0.3, 0.1, 0.01, 0.1, 0.0]
+    assert D3ILEnvConfig(task="aligning").steps_to_end({"observation.environment_state": scene}) == 2

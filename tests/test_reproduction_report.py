@@ -208,15 +208,16 @@ def test_several_folders_are_published_as_one(finished, tmp_path, run_command):
     keep_only("table1", finished)
     more, target = tmp_path / "more", tmp_path / "published"
     shutil.copytree(finished, more)
-    lost = next((finished / "results").glob("evaluate-*-zbc-deterministic-*.json"))
-    kept = next((finished / "results").glob("evaluate-*-wzbc-deterministic-*.json"))
+    files = {
+        (one.policy, one.kind): f"{one.kind}-small_maze-{one.policy}-deterministic-{one.key}.json"
+        for one in load_suites(finished)["table1"].cells
+    }
+    lost, kept = (finished / "results" / files[policy, "evaluate"] for policy in ("zbc", "wzbc"))
     lost.unlink()
     (more / "results" / kept.name).write_text(kept.read_text().replace('"success":[1', '"success":[0'))
-    for file in (more / "results").glob("evaluate-*-zbc-deterministic-*.json"):  # another key
-        renamed = file.with_name(file.name.replace("deterministic-", "deterministic-a"))
-        file.rename(renamed)
-        manifest = more / "suites" / "table1.json"
-        manifest.write_text(manifest.read_text().replace(file.name, renamed.name))
+    manifest = more / "suites" / "table1.json"  # where zbc's evaluation has another key
+    manifest.write_text(manifest.read_text().replace(lost.stem, f"{lost.stem[:-1]}x"))
+    (more / "results" / lost.name).rename(more / "results" / f"{lost.stem[:-1]}x.json")
     run_command(report_command, finished, more, f"--publish={target}", "--suites=[table1]")
     suite = load_suites(target)["table1"]
     assert not suite.missing

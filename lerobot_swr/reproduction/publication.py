@@ -63,15 +63,14 @@ def _merged(first: dict[str, Any] | None, second: dict[str, Any], finished: Cont
         """Kind, dataset, policy and condition, without the cell's key."""
         return file.rpartition("-")[0]
 
-    cells = {what(file): file for file in first["cells"]}
-    for file in second["cells"]:
-        if cells.get(what(file)) not in finished:
-            cells[what(file)] = file
+    there = {what(file) for file in first["cells"] if file in finished}
+    instead = [file for file in second["cells"] if what(file) not in there]
+    kept = [f for f in first["cells"] if f in finished or what(f) not in map(what, instead)]
     return {
         **first,
         "command": "\n".join(dict.fromkeys([*first["command"].split("\n"), second["command"]])),
         "datasets": {**second["datasets"], **first["datasets"]},
-        "cells": list(cells.values()),
+        "cells": [*kept, *(file for file in instead if file not in kept)],
     }
 
 

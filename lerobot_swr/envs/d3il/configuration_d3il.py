@@ -20,7 +20,7 @@ from matplotlib.patches import Circle, Rectangle
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.envs.d3il.behavior import aligning_behavior, avoiding_behavior
+from lerobot_swr.envs.d3il.behavior import aligning_behavior, avoiding_behavior, is_aligned
 from lerobot_swr.envs.d3il.layouts import (
     ALIGNING_EPISODE_LENGTH,
     AVOIDING_EPISODE_LENGTH,
@@ -129,6 +129,14 @@ class D3ILEnvConfig(TaskEnvConfig):
     def behavior_rule(self) -> BehaviorRule:
         """Avoiding: the gaps taken, like ``top-mid-bottom``. Aligning: ``inside`` or ``outside``."""
         return avoiding_behavior if self.task == "avoiding" else aligning_behavior
+
+    def steps_to_end(self, observations: Mapping[str, np.ndarray]) -> int:
+        """Actions until the first state beyond the finish line, or with the box on its target."""
+        if self.task == "avoiding":
+            reached = observations[OBS_STATE][:, 3] > FINISH_LINE_Y
+        else:
+            reached = is_aligned(observations[OBS_ENV_STATE])
+        return int(reached.argmax()) if reached.any() else len(reached)
 
     @property
     def draws_scenes(self) -> bool:
