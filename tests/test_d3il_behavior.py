@@ -122,7 +122,7 @@ def test_rotation_distance_is_the_angle_between(first, second):
 
 
 def test_a_demonstration_ends_where_the_environment_would():
-    """Recordings that run on behind the finish line, or with the box in its place, are not longer for that."""
+    """Recordings that run on behind the finish line, or with the box in place, are not longer for that."""
     path = np.zeros((8, 4), np.float32)
     path[:, 3] = [-0.28, 0.0, 0.2, FINISH_LINE_Y, 0.36, 0.3, 0.37, 0.4]
     avoiding = D3ILEnvConfig(task="avoiding")
