@@ -49,12 +49,14 @@ def plot_behaviors(
         title: Heading.
     """
     figure = Figure(figsize=(13, 4.4), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.35))
+    # Apart, so that long labels under the histograms do not squeeze the paths.
+    scenes, bars = figure.subfigures(1, 2, width_ratios=(2, 1.35))
+    left, middle = scenes.subplots(1, 2)
     colors = behavior_colors([*reference, *shown])
     for axes, paths, name in ((left, demonstrations, "demonstrations"), (middle, rollouts, "rollouts")):
         draw_paths(axes, paths, colors, env_cfg)
         axes.set_title(f"{len(paths)} {name}")
-    draw_histograms(right, reference, shown)
+    draw_histograms(bars.subplots(), reference, shown)
     figure.suptitle(title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -118,7 +120,7 @@ def draw_histograms(axes: Axes, reference: Histogram, shown: Histogram) -> None:
     axes.bar(place + 0.2, [row[2] for row in rows], 0.4, label="rollouts", color=ROLLOUTS)
     axes.set_xticks(place, [row[0] for row in rows], rotation=90 if len(rows) > 6 else 0)
     axes.set(xlabel="behaviour", ylabel="share of episodes")
-    axes.legend()
+    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
 
 
 def plot_offline(
