@@ -9,7 +9,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 
 import pytest
 import torch
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.policies.factory import make_policy_config
@@ -19,8 +19,9 @@ import lerobot_swr  # noqa: F401  (registers policies and environments)
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 
-settings.register_profile("without deadlines", deadline=None)  # a busy machine fails no test
-settings.load_profile("without deadlines")
+# A busy machine fails no test.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 pytest_plugins = ["corrective_policies", "reproduction_cells", "training_command"]  # more fixtures
 

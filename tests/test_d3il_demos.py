@@ -3,8 +3,6 @@
 import math
 import os
 import signal
-import subprocess
-import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
@@ -12,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from held_command import held_command
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -156,21 +155,15 @@ def test_generation_continues_after_an_interruption(tmp_path, n_workers):
 
 
 def test_a_killed_command_continues(tmp_path):
-    """A dataset command killed in the middle leaves no dataset, and its successor uses what was finished."""
-    command = [
-        *(sys.executable, "-c", "from lerobot_swr.cli.dataset import main; main()"),
-        *("--task=d3il_avoiding", f"--root={tmp_path / 'out'}"),
-    ]
-    with (tmp_path / "output").open("w") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output, start_new_session=True)
-        deadline = time.monotonic() + 120
-        while (
-            len(finished := list(tmp_path.glob(".out-*/episodes/*.npz"))) < 2 and time.monotonic() < deadline
-        ):
-            time.sleep(0.2)
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-    assert len(finished) >= 2, (tmp_path / "output").read_text()
+    """A dataset command killed in the middle leaves no dataset, and its successor finds what was finished."""
+    flags = ["--task=d3il_avoiding", f"--root={tmp_path / 'out'}"]
+    third = r"episode-000002\.npz\.\d+\.partial$"
+    with held_command("lerobot_swr.cli.dataset", flags, third) as (command, wait_for_end):
+        while len(finished := list(tmp_path.glob(".out-*/episodes/*.npz"))) < 2:
+            assert command.poll() is None
+            time.sleep(0.1)
+        os.killpg(command.pid, signal.SIGKILL)
+        wait_for_end()
     assert not (tmp_path / "out").exists()
     episode = load_episode(finished[0])
     assert avoiding_behavior(episode.observations) in AVOIDING_BEHAVIORS

@@ -6,9 +6,9 @@ import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
+from held_command import held_command
 
 from lerobot_swr.reproduction import execution, measurement
 from lerobot_swr.reproduction.cells import Cell, Labels, Store, this_command
@@ -241,21 +241,22 @@ def test_killed_in_the_middle_of_a_training_a_suite_ends_with_the_same_results(
     results = {}
     for name in ("whole", "killed"):
         root = tmp_path / name
-        command = [
-            *(sys.executable, "-c", "from lerobot_swr.cli.reproduce import main; main()", "--suite=table1"),
-            *(f"--datasets=[{small_maze.name}]", f"--dataset_dir={small_maze.parent}", "--policies=[wzbc]"),
-            *("--steps=3000", "--seeds=2", "--n_rollouts=6", "--jobs=2", f"--output_dir={root}"),
-        ]
+        main, flags = (
+            "lerobot_swr.cli.reproduce",
+            [
+                *("--suite=table1", f"--datasets=[{small_maze.name}]", f"--dataset_dir={small_maze.parent}"),
+                *("--policies=[wzbc]", "--steps=300", "--seeds=2", "--n_rollouts=6", "--jobs=2"),
+                f"--output_dir={root}",
+            ],
+        )
         if name == "killed":
-            running = subprocess.Popen(command, start_new_session=True)
-            while not list(root.glob("work/train-*/run/seed_1/checkpoints/000300")):
-                assert running.poll() is None, "ended before it could be killed"
-                time.sleep(0.1)
-            kill = os.killpg if everything else os.kill
-            kill(running.pid, signal.SIGKILL)
-            running.wait()
-            assert not list(root.glob("results/train-*"))
-        subprocess.run(command, check=True, timeout=600)
+            second_seed = r"seed_1/checkpoints/\.000060\.unfinished/training_state$"
+            with held_command(main, flags, second_seed) as (running, _):
+                kill = os.killpg if everything else os.kill
+                kill(running.pid, signal.SIGKILL)
+                running.wait()
+                assert not list(root.glob("results/train-*"))
+        subprocess.run([sys.executable, "-c", f"from {main} import main; main()", *flags], check=True)
         stored = [json.loads(path.read_text()) for path in sorted((root / "results").iterdir())]
         results[name] = [(one["key"], one["result"]) for one in stored]
         weights = [p.read_bytes() for p in sorted(root.rglob("model.safetensors"))]

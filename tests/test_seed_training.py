@@ -13,7 +13,7 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
-from training_command import swr_train_killed_at
+from training_command import assert_same_checkpoint
 
 from lerobot_swr.cli import train as train_command
 from lerobot_swr.corrective.inverse_model import fit_inverse_model
@@ -32,18 +32,6 @@ SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
 def weights(run: Path, step: int) -> dict[str, torch.Tensor]:
     """The saved tensors of a run's checkpoint."""
     return load_file(run / "checkpoints" / f"{step:06d}" / "pretrained_model" / "model.safetensors")
-
-
-def assert_same_files(one: Path, other: Path) -> None:
-    """Weights and the whole training state of two checkpoints are equal, bit for bit."""
-    tensors = ("optimizer_state.safetensors", "rng_state.safetensors")
-    for name in ("pretrained_model/model.safetensors", *(f"training_state/{file}" for file in tensors)):
-        expected, found = load_file(one / name), load_file(other / name)
-        assert expected.keys() == found.keys()
-        for key, value in expected.items():
-            assert torch.equal(value, found[key]), (name, key)
-    for name in ("optimizer_param_groups.json", "scheduler_state.json", "training_step.json"):
-        assert (one / "training_state" / name).read_text() == (other / "training_state" / name).read_text()
 
 
 def test_frames_come_in_lerobots_order():
@@ -158,25 +146,10 @@ def test_a_seed_trained_alone_equals_that_seed_among_others(monkeypatch, swr_tra
         swr_train(*train_flags(*common, tmp_path / "alone", 40, *SMALL, "--seeds=2", "--jobs=1"))
     swr_train(*train_flags(*common, tmp_path / "five", 40, *SMALL, "--seeds=0,1,2,3,4", "--jobs=2"))
     last = Path("seed_2") / "checkpoints" / "000040"
-    assert_same_files(tmp_path / "alone" / last, tmp_path / "five" / last)
+    assert_same_checkpoint(tmp_path / "alone" / last, tmp_path / "five" / last)
     assert (
         weights(tmp_path / "five" / "seed_0", 40).keys() == weights(tmp_path / "five" / "seed_4", 40).keys()
     )
-
-
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path, jobs):
-    """kill -9 in the middle, then --resume=true: every seed ends as in an uninterrupted run."""
-    flags = [*SMALL, "--save_freq=20", "--seeds=0,1,2", f"--jobs={jobs}"]
-    steps = 400
-    swr_train(*train_flags("wzbc", small_maze, tmp_path / "whole", steps, *flags))
-    killed = train_flags("wzbc", small_maze, tmp_path / "killed", steps, *flags)
-    swr_train_killed_at(tmp_path / "killed" / "seed_2" / "checkpoints" / "000040", killed)
-    assert not (tmp_path / "killed" / "seed_2" / "checkpoints" / f"{steps:06d}").is_dir()
-    swr_train(*killed, "--resume=true")
-    for seed in range(3):
-        last = Path(f"seed_{seed}") / "checkpoints" / f"{steps:06d}"
-        assert_same_files(tmp_path / "whole" / last, tmp_path / "killed" / last)
 
 
 def test_lerobot_train_goes_on_from_a_seeds_checkpoint(

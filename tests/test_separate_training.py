@@ -13,7 +13,7 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies.factory import make_policy_config
 from safetensors.torch import load_file
 from torch.utils.data import DataLoader
-from training_command import swr_train_killed_at
+from training_command import assert_same_checkpoint
 
 from lerobot_swr.training import SeedsTrainConfig
 from lerobot_swr.training.memory_dataset import MemoryDataset
@@ -37,15 +37,6 @@ def make_dataset(small_maze, small_maze_meta):
         )
 
     return make
-
-
-def assert_same_run(one: Path, other: Path) -> None:
-    """Weights and the optimizer's state of two checkpoints are equal, bit for bit."""
-    for name in ("pretrained_model/model", "training_state/optimizer_state"):
-        expected, found = (load_file(folder / f"{name}.safetensors") for folder in (one, other))
-        assert expected.keys() == found.keys()
-        for key, value in expected.items():
-            assert torch.equal(value, found[key]), (name, key)
 
 
 @pytest.mark.parametrize("episodes", [None, [1, 4, 5]])
@@ -100,21 +91,7 @@ def test_a_seed_is_trained_as_lerobot_train_does(
     torch.set_num_threads(threads)
     swr_train(*train_flags(*common, tmp_path / "all", 20, *flags, "--seeds=3", "--jobs=1"))
     last = Path("checkpoints") / "last"
-    assert_same_run(tmp_path / "one" / last, tmp_path / "all" / "seed_3" / last)
-
-
-def test_a_killed_command_goes_on_to_the_same_weights(swr_train, small_maze, tmp_path):
-    """kill -9 in the middle, then --resume=true: every seed ends as in an uninterrupted run."""
-    flags = [*SMALL["beso"], "--save_freq=20", "--seeds=0,1", "--jobs=2"]
-    steps = 200
-    swr_train(*train_flags("beso", small_maze, tmp_path / "whole", steps, *flags))
-    killed = train_flags("beso", small_maze, tmp_path / "killed", steps, *flags)
-    swr_train_killed_at(tmp_path / "killed/seed_1/checkpoints/000040", killed)
-    assert not (tmp_path / "killed/seed_1/checkpoints/000200").is_dir()
-    swr_train(*killed, "--resume=true")
-    for seed in range(2):
-        last = Path(f"seed_{seed}/checkpoints/000200")
-        assert_same_run(tmp_path / "whole" / last, tmp_path / "killed" / last)
+    assert_same_checkpoint(tmp_path / "one" / last, tmp_path / "all" / "seed_3" / last)
 
 
 def test_resuming_keeps_what_is_complete(swr_train, small_maze, tmp_path):

@@ -1,5 +1,6 @@
 """LeRobot's own training command with this plugin: resume, subsets, several processes, refusals."""
 
+import contextlib
 import os
 import re
 import shutil
@@ -15,6 +16,7 @@ from conftest import train_flags
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file
+from training_command import forget_after
 
 SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2")
 
@@ -31,16 +33,24 @@ def load(output_dir: Path):
     return get_policy_class(config.type).from_pretrained(folder, config=config)
 
 
-@pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
-def test_a_killed_run_resumes_to_the_same_weights(lerobot_train_command, small_maze, tmp_path, policy_type):
-    """Uninterrupted: 30 steps. Killed after step 10 and resumed: the same weights, bit for bit."""
+@pytest.mark.parametrize(
+    ("policy_type", "killed_at"),
+    [
+        ("zbc", 10),
+        ("wzbc", 10),
+        pytest.param("zbc", 20, marks=pytest.mark.xfail(reason="huggingface/lerobot#4692: second epoch")),
+    ],
+)
+def test_a_killed_run_resumes_to_the_same_weights(
+    lerobot_train_command, small_maze, tmp_path, policy_type, killed_at
+):
+    """Uninterrupted: 30 steps. Killed within the first epoch and resumed: the same weights, bit for bit."""
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    flags = [*SMALL, "--save_freq=10", "--log_freq=5"]
+    flags = [*SMALL, "--save_freq=10", "--log_freq=5", "--dataset.episodes=[0,2,4]"]  # 12 steps an epoch
     lerobot_train_command(*train_flags(policy_type, small_maze, whole, 30, *flags))
     shutil.copytree(whole, killed, symlinks=True)
-    for step in (20, 30):
-        shutil.rmtree(killed / "checkpoints" / f"{step:06d}")
-    config = killed / "checkpoints" / "000010" / "pretrained_model" / "train_config.json"
+    forget_after(killed_at, killed)
+    config = killed / "checkpoints" / f"{killed_at:06d}" / "pretrained_model" / "train_config.json"
     config.write_text(config.read_text().replace(str(whole), str(killed)))
     lerobot_train_command(f"--config_path={config}", "--resume=true")
     expected, resumed = weights(whole, 30), weights(killed, 30)
@@ -91,16 +101,13 @@ def test_two_processes_train_one_cookbook(small_maze, tmp_path):
         run = subprocess.Popen(
             [sys.executable, *command], env=environment, stdout=file, stderr=file, start_new_session=True
         )
-        deadline = time.monotonic() + 240
-        while run.poll() is None and time.monotonic() < deadline:
-            if "End of training" in log.read_text():  # torch's gloo can deadlock in a process that ends
-                deadline = min(deadline, time.monotonic() + 15)
+        while run.poll() is None and "End of training" not in log.read_text():
             time.sleep(0.2)
-        if run.poll() is None:
+        with contextlib.suppress(ProcessLookupError):  # torch's gloo can deadlock in processes that end
             os.killpg(run.pid, signal.SIGKILL)
-            run.wait()
+        run.wait()
     logged = log.read_text()
-    assert run.returncode == 0 or "End of training" in logged, logged[-3000:]
+    assert "End of training" in logged, logged[-3000:]
     policy = load(output_dir)
     assert policy.styles.trained.all()
     assert "Effective batch size: 8 x 2 = 16" in logged

@@ -1,6 +1,9 @@
 """Processes that train seeds beside each other."""
 
+import multiprocessing
+import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -43,6 +46,21 @@ def run_processes(
             process.terminate()
         for _, process in running:
             process.join()
+
+
+def end_with_parent() -> None:
+    """In such a process: end at once when the one that started it does, however that ends.
+
+    What a killed command leaves must not go on beside the command that resumes it.
+    """
+    threading.Thread(target=_wait_for_parent, daemon=True).start()
+
+
+def _wait_for_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager

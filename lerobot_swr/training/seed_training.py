@@ -3,7 +3,6 @@
 import logging
 import math
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator
 from itertools import groupby
 from multiprocessing.process import BaseProcess
@@ -21,7 +20,7 @@ from tqdm import tqdm
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.memory import keep_freed_memory, large_pages
-from lerobot_swr.training.processes import explained_exit, run_processes
+from lerobot_swr.training.processes import end_with_parent, explained_exit, run_processes
 from lerobot_swr.training.seed_runs import SeedRuns, check_options, last_step, point_to_last
 from lerobot_swr.training.separate_training import train_separately
 
@@ -74,7 +73,7 @@ def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps
     context = multiprocessing.get_context("spawn")
     done = context.Array("q", len(groups), lock=False)
     processes: list[tuple[list[int], BaseProcess]] = [
-        (seeds, context.Process(target=_process, args=(config, seeds, done, i, os.getpid()), daemon=True))
+        (seeds, context.Process(target=_process, args=(config, seeds, done, i), daemon=True))
         for i, seeds in enumerate(groups)
     ]
     total = sum(config.steps - steps[seed] for seeds in groups for seed in seeds)
@@ -82,14 +81,13 @@ def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps
         run_processes(processes, config.jobs or 1, lambda: bar.update(sum(done) - bar.n))
 
 
-def _process(config: SeedsTrainConfig, seeds: list[int], done: Any, group: int, parent: int) -> None:
+def _process(config: SeedsTrainConfig, seeds: list[int], done: Any, group: int) -> None:
     """What a process does: train a group of seeds, counting into ``done[group]``; end with its parent."""
 
     def count() -> None:
-        if os.getppid() != parent:
-            os._exit(1)
         done[group] += len(seeds)
 
+    end_with_parent()
     init_logging()
     with explained_exit():
         _train_group(config, seeds, count)

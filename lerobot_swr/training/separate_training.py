@@ -1,9 +1,7 @@
 """Trains seeds one by one with LeRobot's own loop, on frames in memory: policies that cannot be stacked."""
 
 import multiprocessing
-import os
 import sys
-import threading
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from unittest.mock import patch
@@ -15,9 +13,10 @@ from lerobot.utils.import_utils import register_third_party_plugins
 
 from lerobot_swr.configuration import resuming
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
+from lerobot_swr.training.exact_accelerator import exact_accelerator
 from lerobot_swr.training.memory import keep_freed_memory
 from lerobot_swr.training.memory_dataset import frames_in_memory
-from lerobot_swr.training.processes import explained_exit, run_processes
+from lerobot_swr.training.processes import end_with_parent, explained_exit, run_processes
 from lerobot_swr.training.seed_runs import drop_incomplete, last_step, point_to_last
 
 OPTIONS_ON_RESUME = ("save_freq", "log_freq", "num_workers", "env_eval_freq", "eval_steps")
@@ -48,20 +47,34 @@ def train_separately(config: SeedsTrainConfig) -> list[Path]:
 
 
 def _train_seed(config: SeedsTrainConfig, seed: int) -> None:
-    """Start a run, or go on with it; in a process of its own."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    """Train a seed in a process of its own."""
+    end_with_parent()
     register_third_party_plugins()
     torch.set_num_threads(1)  # several processes share the cores
     keep_freed_memory()
-    run = config.of_seed(seed)
+    with explained_exit():
+        train_run(config.of_seed(seed))
+
+
+def train_run(run: TrainPipelineConfig) -> None:
+    """Start a run, or go on with it from its last complete checkpoint, in this process.
+
+    Args:
+        run: Configuration of a seed's run, as `SeedsTrainConfig.of_seed` makes it.
+
+    Raises:
+        ValueError: If LeRobot's loop refuses the configuration, or the dataset has images.
+    """
+    assert run.policy is not None
     drop_incomplete(run)
-    with explained_exit(), frames_in_memory():
+    accelerator = exact_accelerator(run.policy)
+    with frames_in_memory():
         if last_step(run):
             with patch.object(sys, "argv", _resume_command(run)):
-                lerobot_train.train()
+                lerobot_train.train(accelerator=accelerator)
         else:
             with resuming(False):  # whatever the command said of the other seeds
-                lerobot_train.train(run)
+                lerobot_train.train(run, accelerator=accelerator)
 
 
 def _resume_command(run: TrainPipelineConfig) -> list[str]:
@@ -75,11 +88,3 @@ def _resume_command(run: TrainPipelineConfig) -> list[str]:
     if run.dataset.root is not None:
         options["dataset.root"] = run.dataset.root
     return ["lerobot-train", *(f"--{key}={value}" for key, value in options.items())]
-
-
-def _end_with_parent() -> None:
-    """A run whose command was killed must not go on beside the one that resumes it."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
