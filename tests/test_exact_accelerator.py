@@ -14,13 +14,11 @@ from lerobot_swr.training.exact_accelerator import ExactAccelerator, precision_o
 
 BATCH, STEPS = 4, 11  # an epoch has 4 steps, the last one of 2 frames
 FRAMES = TensorDataset(torch.arange(20))
-PLACES = {
-    "alone": ({"num_workers": 0}, range(1, STEPS)),
-    "lasting workers": (
-        {"num_workers": 2, "persistent_workers": True, "multiprocessing_context": "spawn"},
-        (2, 4, 9),
-    ),
-    "workers of an epoch": ({"num_workers": 2, "multiprocessing_context": "spawn"}, (2, 4)),
+WORKERS = {"num_workers": 2, "multiprocessing_context": "fork"}
+LOADING = {
+    "without workers": {"num_workers": 0},
+    "with workers": WORKERS,
+    "with lasting workers": WORKERS | {"persistent_workers": True},
 }
 
 
@@ -36,19 +34,19 @@ def train(accelerator: Accelerator, options: dict, start: int, state: torch.Tens
     return [(batch.tolist(), torch.rand(1).item(), torch.get_rng_state()) for (batch,) in batches]
 
 
-@pytest.mark.parametrize(("options", "starts"), PLACES.values(), ids=PLACES)
-def test_a_resumed_run_sees_and_draws_what_it_would_have(options, starts):
-    """From steps in three epochs, at their ends and within, with an accelerator that knows nothing of it."""
+@pytest.mark.parametrize("options", LOADING.values(), ids=LOADING)
+def test_a_resumed_run_sees_and_draws_what_it_would_have(options):
+    """From steps within three epochs and at their ends, beside a run of a plain accelerator."""
     whole = train(Accelerator(cpu=True), options, 0)
-    for start in starts:
+    for start in (2, 4, 9) if options["num_workers"] else range(1, STEPS):
         resumed = train(ExactAccelerator(cpu=True), options, start, whole[start - 1][2])
         for (seen, drawn, _), expected in zip(resumed, whole[start:], strict=True):
             assert (seen, drawn) == expected[:2], start
 
 
 def test_a_new_run_is_that_of_any_accelerator():
-    """With this one, too."""
-    options = PLACES["alone"][0]
+    """It sees and draws the same."""
+    options = LOADING["without workers"]
     plain, exact = (train(make(cpu=True), options, 0) for make in (Accelerator, ExactAccelerator))
     assert [step[:2] for step in plain] == [step[:2] for step in exact]
 

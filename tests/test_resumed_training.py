@@ -12,7 +12,8 @@ from training_command import assert_same_checkpoint, forget_after, swr_train_kil
 from lerobot_swr.training import SeedsTrainConfig
 from lerobot_swr.training.separate_training import train_run
 
-# Two episodes of the small maze in batches of 32: an epoch has 4 steps, the last one with fewer frames.
+# Two episodes of the small maze in batches of 32: an epoch has 4 steps, the last one with fewer frames. With
+# diffusion, which leaves the episodes' ends out, it has 3.
 EPISODES, BATCH_SIZE = [0, 4], 32
 STEPS, STOPS = 12, (2, 4, 6, 10)  # within the first epoch, at its end, within the second and the third
 
