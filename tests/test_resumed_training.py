@@ -39,6 +39,7 @@ def small_run(policy_type: str, root: Path, output_dir: Path):
         num_workers=0,
         steps=STEPS,
         save_freq=2,
+        resume=True,
     )
     config.validate()
     return config.of_seed(3)
