@@ -1,7 +1,9 @@
 """How configurations of this package meet LeRobot's parser: refusing bad values, telling what a run is."""
 
 import functools
+import logging
 import math
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -15,6 +17,10 @@ from lerobot.configs import parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_swr.dataset_checks import check_format
+
+logger = logging.getLogger(__name__)
 
 
 def tells_bad_values(post_init: Callable[[Any], None]) -> Callable[[Any], None]:
@@ -37,17 +43,47 @@ def tells_bad_values(post_init: Callable[[Any], None]) -> Callable[[Any], None]:
 
 
 def check_dataset_folder() -> None:
-    """Refuse a ``--dataset.root`` that neither exists nor can be downloaded.
+    """Refuse a ``dataset.root``, of the command line or its configuration file, that cannot be used.
 
     Raises:
-        ValueError: If the command line names a folder that does not exist while the Hub is switched off.
+        ValueError: If the folder does not exist while the Hub is switched off, or LeRobot cannot read the
+            dataset in it.
     """
-    root = parser.parse_arg("dataset.root")
-    if root is not None and constants.HF_HUB_OFFLINE and not Path(root).is_dir():
+    root, origin = parser.parse_arg("dataset.root"), ""
+    advice = "check the path, or make the dataset (lerobot-swr-dataset)"
+    file = parser.parse_arg("config_path")
+    if root is None and file is not None and Path(file).exists():
+        root, origin = _dataset_of_file(file).get("root"), f", from {file}"
+        advice = "was it moved? Give its folder: --dataset.root=FOLDER"
+    if root is None:
+        return
+    if Path(root).is_dir():
+        check_format(Path(root), parser.parse_arg("dataset.repo_id"))
+    elif constants.HF_HUB_OFFLINE:
         raise ValueError(
-            f"dataset.root={root!r}: no such folder, and HF_HUB_OFFLINE is set, so it cannot be downloaded; "
-            "check the path, or make the dataset (lerobot-swr-dataset)"
+            f"dataset.root={root!r}{origin}: no such folder, and HF_HUB_OFFLINE is set, so it cannot be "
+            f"downloaded; {advice}"
         )
+    elif origin:
+        logger.warning("dataset.root=%r%s: no such folder; looking on the Hub; %s", root, origin, advice)
+
+
+def check_checkpoint_path(path: str) -> None:
+    """Refuse what is neither a folder on this machine nor the name of a repository of the Hub.
+
+    Raises:
+        FileNotFoundError: Naming the part of the path that exists, and what is in there.
+    """
+    folder = Path(path)
+    if folder.is_dir() or (re.fullmatch(r"[\w.-]+/[\w.-]+", path) and not folder.parent.is_dir()):
+        return
+    exists = next(parent for parent in folder.absolute().parents if parent.is_dir())
+    inside = sorted(child.name for child in exists.iterdir() if child.is_dir())
+    listed = ", ".join(inside[:8]) + (f" and {len(inside) - 8} more" if len(inside) > 8 else "")
+    raise FileNotFoundError(
+        f"policy.path={path!r}: no such folder; {exists} exists and has the folders: {listed or 'none'}; "
+        "give a checkpoint's pretrained_model folder"
+    )
 
 
 _training_on: ContextVar[DatasetConfig | None] = ContextVar("training_on", default=None)

@@ -1,14 +1,17 @@
-"""Episodes of a LeRobotDataset as arrays, read straight from its parquet files."""
+"""Episodes of a LeRobotDataset as arrays."""
 
 import hashlib
+import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 from lerobot.datasets import LeRobotDatasetMetadata
+
+from lerobot_swr.dataset_checks import edit_command
+from lerobot_swr.dataset_files import read_frames
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -21,6 +24,7 @@ class Trajectories:
         fps: Control rate of the recording, in Hz.
         name: How messages call the dataset.
         tasks: N task strings, or empty.
+        index: (sum of lengths,) int64, the dataset's own number of each frame; None where it is the row.
     """
 
     lengths: np.ndarray
@@ -28,6 +32,7 @@ class Trajectories:
     fps: int
     name: str
     tasks: tuple[str, ...] = ()
+    index: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -69,7 +74,19 @@ class Trajectories:
         if (lengths == 0).any():
             raise ValueError(f"dataset {self.name}: nothing is left of episode {int(lengths.argmin())}")
         columns = {key: column[~left_out] for key, column in self.columns.items()}
-        return replace(self, lengths=lengths, columns=columns)
+        return replace(self, lengths=lengths, columns=columns, index=None)
+
+    def rows_of(self, episodes: np.ndarray) -> np.ndarray:
+        """(F,) rows of frames of which only the (F,) `episodes` are known, each episode's in order.
+
+        Frames beyond an episode's length, or of none that is here, get any row.
+        """
+        order = np.argsort(episodes, kind="stable")
+        ordered = episodes[order]
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order)) - np.searchsorted(ordered, ordered)
+        known = np.clip(episodes, 0, len(self) - 1)
+        return self.starts[known] + np.minimum(rank, self.lengths[known] - 1)
 
     def fingerprint(self, keys: Sequence[str]) -> str:
         """Hash of the content of the features `keys` and of the episodes' lengths, in hexadecimal."""
@@ -80,65 +97,70 @@ class Trajectories:
         return digest.hexdigest()[:32]
 
 
-def load_trajectories(meta: LeRobotDatasetMetadata, keys: Sequence[str]) -> Trajectories:
-    """Read low-dimensional features of every episode of a dataset.
+def load_trajectories(
+    meta: LeRobotDatasetMetadata, keys: Sequence[str], optional: Sequence[str] = ()
+) -> Trajectories:
+    """Read low-dimensional features of every episode of a dataset, as LeRobot reads them.
 
     Args:
         meta: Metadata of a dataset whose data files are on this machine.
         keys: Names of numeric or boolean features, e.g. ``["observation.state", "action"]``.
+        optional: Further features; one that is no numbers or not finite is left out, with a warning.
 
     Raises:
         FileNotFoundError: If the dataset's data files are not on this machine.
         ValueError: If a feature is missing, a value is not finite or the frames do not match the metadata.
     """
-    name = str(meta.root)
-    for key in keys:
-        if key not in meta.features:
-            raise ValueError(f"dataset {name}: no feature {key!r}; it has: {', '.join(meta.features)}")
-    files = sorted((Path(meta.root) / "data").glob("chunk-*/file-*.parquet"))
-    if not files:
-        raise FileNotFoundError(
-            f"dataset {name}: no data/chunk-*/file-*.parquet; download the dataset first "
-            "(streamed datasets are not supported, they hide the episodes)"
-        )
-    table = pa.concat_tables(
-        [pq.read_table(file, columns=["index", "episode_index", *keys]) for file in files]
-    )
-    table = table.sort_by("index")
-    columns = {key: _as_array(table.column(key), key, name) for key in keys}
-    episode_index = table.column("episode_index").to_numpy()
-    lengths = np.bincount(episode_index, minlength=meta.total_episodes).astype(np.int64)
-    if len(lengths) != meta.total_episodes or (lengths == 0).any() or (np.diff(episode_index) < 0).any():
-        raise ValueError(
-            f"dataset {name}: meta/info.json promises {meta.total_episodes} episodes in order, the data "
-            f"files hold {len(np.unique(episode_index))}; is the dataset complete (was it finalized)?"
-        )
-    tasks = tuple("; ".join(names) for names in meta.episodes["tasks"])
-    trajectories = Trajectories(lengths, columns, meta.fps, name, tasks)
-    _check_finite(trajectories, episode_index)
-    return trajectories
-
-
-def _as_array(column: pa.ChunkedArray, key: str, name: str) -> np.ndarray:
-    """A column of numbers, of truth values or of lists of equal length of them as (frames, d) float32."""
-    array = column.combine_chunks()
-    n_frames = len(array)
-    while pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
-        array = array.flatten()
-    numeric = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
-    if not any(is_kind(array.type) for is_kind in numeric):
-        raise ValueError(f"dataset {name}: feature {key!r} is not numeric ({array.type})")
-    return array.to_numpy(zero_copy_only=False).reshape(n_frames, -1).astype(np.float32)
-
-
-def _check_finite(trajectories: Trajectories, episode_index: np.ndarray) -> None:
-    for key, column in trajectories.columns.items():
-        bad_rows = np.flatnonzero(~np.isfinite(column).all(axis=1))
-        if len(bad_rows):
-            episode = int(episode_index[bad_rows[0]])
-            frame = int(bad_rows[0] - trajectories.starts[episode])
+    frames = read_frames(meta, keys, optional)
+    columns = {}
+    for key, column in frames.columns.items():
+        reason = _not_finite(meta, key, column, frames.lengths)
+        if reason is None:
+            columns[key] = column
+        elif key in keys:
             raise ValueError(
-                f"dataset {trajectories.name}: feature {key!r} is NaN or infinite in {len(bad_rows)} frames, "
-                f"first in episode {episode}, frame {frame}; repair or drop these episodes "
-                "(lerobot-edit-dataset --operation.type=delete_episodes)"
+                f"{reason}; repair these episodes or drop them ({edit_command(meta, 'delete_episodes')} "
+                "--operation.episode_indices=[...])"
             )
+        else:
+            logger.warning("left out: %s", reason)
+    tasks = _episode_tasks(meta, frames.task_index)
+    return Trajectories(frames.lengths, columns, meta.fps, str(meta.root), tasks, frames.index)
+
+
+def _not_finite(
+    meta: LeRobotDatasetMetadata, key: str, column: np.ndarray, lengths: np.ndarray
+) -> str | None:
+    """What is wrong with a column that is not finite; None for a good one."""
+    bad_rows = np.flatnonzero(~np.isfinite(column).all(axis=1))
+    if not len(bad_rows):
+        return None
+    ends = np.cumsum(lengths)
+    episodes = np.searchsorted(ends, bad_rows, side="right")
+    first = int(episodes[0])
+    frame = int(bad_rows[0] - (ends[first] - lengths[first]))
+    more = len(np.unique(episodes)) - 1
+    return (
+        f"dataset {meta.root}: feature {key!r} is NaN or infinite in {len(bad_rows)} frames, first in "
+        f"episode {first}, frame {frame}" + (f", and in {more} more episodes" if more else "")
+    )
+
+
+def _episode_tasks(meta: LeRobotDatasetMetadata, task_index: np.ndarray | None) -> tuple[str, ...]:
+    """N task strings: of the table of episodes, else of each first frame; empty if none is known."""
+    has_list = meta.episodes is not None and "tasks" in meta.episodes.column_names
+    tasks = [_joined(names) for names in meta.episodes["tasks"]] if has_list else [""] * meta.total_episodes
+    if meta.tasks is not None and task_index is not None:
+        column = meta.tasks["task"] if "task" in meta.tasks.columns else meta.tasks.index
+        known = [str(name) for name in column]  # LeRobot counts rows
+        tasks = [
+            task or (known[i] if 0 <= i < len(known) else "")
+            for task, i in zip(tasks, task_index.tolist(), strict=True)
+        ]
+    return tuple(tasks) if any(tasks) else ()
+
+
+def _joined(names: str | Sequence[str | None] | None) -> str:
+    if names is None or isinstance(names, str):
+        return names or ""
+    return "; ".join(name for name in names if name)

@@ -23,7 +23,12 @@ from lerobot_swr.demos.maze2d import _recipe, steady
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
-pytest_plugins = ["corrective_policies", "reproduction_cells", "training_command"]  # more fixtures
+pytest_plugins = [
+    "corrective_policies",
+    "odd_datasets",
+    "reproduction_cells",
+    "training_command",
+]  # more fixtures
 
 SMALL_MAZE = {"10": 4, "20": 2}  # behaviour -> number of episodes
 OBSERVATIONS = ("observation.state", "observation.environment_state")

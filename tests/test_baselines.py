@@ -7,11 +7,15 @@ import pytest
 import torch
 from conftest import OBSERVATIONS, WINDOW, make_windows, save_checkpoint
 from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies.factory import get_policy_class, make_policy_config
 from safetensors.torch import load_file
 
+from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.policies import baselines
 from lerobot_swr.policies.baselines.averaging import moving_average
+from lerobot_swr.trajectories import load_trajectories
 
 BASELINES = ("ddpm_gpt", "ddpm_act", "beso")
 
@@ -192,11 +196,13 @@ def test_a_checkpoint_holds_weights_and_average_and_acts_alike(
 def test_on_other_data_the_bounds_are_new(make_baseline, small_maze_meta, tmp_path):
     """Fine-tuning normalises by the new dataset's statistics, so the checkpoint's bounds mean nothing."""
     save_checkpoint(make_baseline("beso"), small_maze_meta, tmp_path / "c")
-    stats = copy.deepcopy(small_maze_meta.stats)
-    stats["action"]["max"] = stats["action"]["mean"] + 3 * stats["action"]["std"]
+    write_dataset(_recipe("other", "small", {"20": 2}, steady), tmp_path / "other", seed=3)
+    meta = LeRobotDatasetMetadata("local/other", root=tmp_path / "other")
     config = PreTrainedConfig.from_pretrained(tmp_path / "c")
-    tuned = get_policy_class("beso").from_pretrained(tmp_path / "c", config=config, dataset_stats=stats)
-    torch.testing.assert_close(tuned.action_high, torch.tensor([3.0, 3.0]), rtol=1e-4, atol=0)
+    tuned = get_policy_class("beso").from_pretrained(tmp_path / "c", config=config, dataset_meta=meta)
+    actions = load_trajectories(meta, ["action"]).columns["action"]
+    expected = (actions.max(axis=0) - meta.stats["action"]["mean"]) / meta.stats["action"]["std"]
+    torch.testing.assert_close(tuned.action_high, torch.from_numpy(expected).float(), rtol=1e-4, atol=1e-6)
 
 
 # --- draws ---

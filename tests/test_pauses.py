@@ -82,10 +82,9 @@ def test_pauses_teach_nothing_and_the_mean_weight_is_one(make_tiny_policy, monke
     policy = make_tiny_policy("zbc", balance_episodes=balance)
     trajectories, pauses = policy.trajectories, marked["pauses"]
     episodes = np.repeat(np.arange(len(trajectories)), trajectories.lengths)
-    frames = np.arange(len(episodes)) - trajectories.starts[episodes]
     batch = make_batch(len(episodes))
     batch["episode_index"] = torch.from_numpy(episodes)
-    batch["timestamp"] = torch.from_numpy((frames / trajectories.fps).astype(np.float32))
+    batch["index"] = torch.arange(len(episodes))
     losses, _ = policy.forward(batch, reduction="none")
     weights = policy.frame_weights(batch).numpy()
     assert (losses.detach().numpy()[pauses] == 0).all()

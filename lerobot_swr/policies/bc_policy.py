@@ -7,9 +7,10 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
+from lerobot_swr.frame_rows import FrameRows
 from lerobot_swr.policies.configuration_swr import BCConfig
 from lerobot_swr.policies.dataset_policy import DatasetPolicy
-from lerobot_swr.policies.network import ActionNetwork
+from lerobot_swr.policies.network import ActionNetwork, check_same_shape
 
 
 class BCPolicy(DatasetPolicy):
@@ -21,8 +22,8 @@ class BCPolicy(DatasetPolicy):
         **kwargs: Whatever else LeRobot's factory passes (``dataset_stats``).
 
     Raises:
-        ValueError: If the dataset lacks ``observation.state`` or ``action`` or holds NaN, or if a resumed
-            run's dataset is not the checkpoint's.
+        ValueError: If the dataset lacks ``observation.state`` or ``action``, their data or statistics are
+            not usable, or if a resumed run's dataset is not the checkpoint's.
     """
 
     config_class = BCConfig
@@ -36,7 +37,7 @@ class BCPolicy(DatasetPolicy):
         self._is_pause: Tensor | None = None
         if self.pauses is not None:
             self._is_pause = torch.from_numpy(self.pauses)
-            self._starts = torch.from_numpy(self.trajectories.starts)
+            self._rows = FrameRows(self.trajectories)
 
     @property
     def _style_dim(self) -> int:
@@ -79,7 +80,7 @@ class BCPolicy(DatasetPolicy):
 
         Args:
             batch: Normalised observations (B, d), ``action`` (B, A), ``episode_index`` (B,) and, where the
-                dataset has pauses, ``timestamp`` (B,) in seconds.
+                dataset has pauses, ``index`` (B,), the dataset's number of each frame.
             reduction: ``mean``, or ``none`` for one loss per frame.
 
         Returns:
@@ -112,9 +113,8 @@ class BCPolicy(DatasetPolicy):
         weights = self._episode_weights[episodes]
         if self._is_pause is None:
             return weights
-        self._is_pause, self._starts = self._is_pause.to(episodes.device), self._starts.to(episodes.device)
-        frames = (batch["timestamp"].flatten() * self.trajectories.fps).round().to(torch.int64)
-        return weights * ~self._is_pause[self._starts[episodes] + frames]
+        self._is_pause = self._is_pause.to(episodes.device)
+        return weights * ~self._is_pause[self._rows(batch)]
 
     def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B,) weighted loss of each frame; a pure function of the parameters and of what `draw` returned."""
@@ -126,7 +126,12 @@ class BCPolicy(DatasetPolicy):
 
     @staticmethod
     def _action_errors(predicted: Tensor, batch: dict[str, Tensor]) -> Tensor:
-        """(B,) squared error of (B, A) actions, mean over the action's dimensions."""
+        """(B,) squared error of (B, A) actions, mean over the action's dimensions.
+
+        Raises:
+            ValueError: If the batch's actions have another shape than those that are predicted.
+        """
+        check_same_shape(predicted, batch[ACTION])
         return (predicted - batch[ACTION]).square().mean(dim=-1)
 
     # --- LeRobot's inference interface ---

@@ -12,8 +12,9 @@ from torch import Tensor
 from lerobot_swr.configuration import is_resuming
 from lerobot_swr.pauses import pause_frames
 from lerobot_swr.policies.configuration_swr import BCConfig
-from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors, with_unit_std_where_constant
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.policies.state_policy import StatePolicy
+from lerobot_swr.policies.training_data import read_training_data
 from lerobot_swr.sampling import StepGenerator
 from lerobot_swr.style_encoding import Frames
 from lerobot_swr.style_table import OUTCOMES
@@ -30,8 +31,8 @@ class DatasetPolicy(StatePolicy):
         dataset_meta: Metadata of the training dataset; given when the policy is trained, absent at inference.
 
     Raises:
-        ValueError: If the dataset lacks ``observation.state`` or ``action`` or holds NaN, or if a resumed
-            run's dataset is not the checkpoint's.
+        ValueError: If the dataset lacks ``observation.state`` or ``action``, their data or statistics are
+            not usable, or if a resumed run's dataset is not the checkpoint's.
     """
 
     config_class = BCConfig
@@ -40,7 +41,7 @@ class DatasetPolicy(StatePolicy):
     pauses: np.ndarray | None = None  # (F,) bool, which frames of the training dataset are left out, if any
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None):
-        super().__init__(config)
+        super().__init__(config, dataset_meta)
         self._trajectories: Trajectories | None = None
         self._dataset_meta: LeRobotDatasetMetadata | None = None
         self._new_dataset = False
@@ -50,10 +51,8 @@ class DatasetPolicy(StatePolicy):
     def _adopt_dataset(self, meta: LeRobotDatasetMetadata) -> None:
         """Read the training dataset; tell whether the checkpoint, if any, was trained on it."""
         config = self.config
-        self._trajectories = self.read_demonstrations(meta)
+        self._trajectories = read_training_data(config, meta, OUTCOMES)
         self._dataset_meta = meta
-        # LeRobot's own fine-tuning would hand the raw statistics to the processors.
-        meta.stats = with_unit_std_where_constant(config, meta.stats)
         fingerprint = self._trajectories.fingerprint([OBS_STATE])
         known = config.dataset_fingerprint
         self._new_dataset = known is not None and known != fingerprint
@@ -79,8 +78,7 @@ class DatasetPolicy(StatePolicy):
 
     def read_demonstrations(self, meta: LeRobotDatasetMetadata) -> Trajectories:
         """What a policy like this one takes from a dataset: observations, actions and, if any, outcomes."""
-        outcomes = [key for key in OUTCOMES if key in meta.features]
-        return load_trajectories(meta, [*self.config.observation_keys, ACTION, *outcomes])
+        return load_trajectories(meta, [*self.config.observation_keys, ACTION], OUTCOMES)
 
     @property
     def trajectories(self) -> Trajectories:

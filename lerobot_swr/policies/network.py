@@ -83,3 +83,16 @@ class ActionNetwork(nn.Module):
         if style is not None:
             features = torch.cat([features, style], dim=-1)
         return self.head(self.trunk(features))
+
+
+def check_same_shape(predicted: Tensor, actions: Tensor) -> None:
+    """Refuse to compare tensors that would be broadcast.
+
+    Raises:
+        ValueError: Naming both shapes.
+    """
+    if predicted.shape != actions.shape:
+        raise ValueError(
+            f"the batch's actions have shape {list(actions.shape)}, those predicted {list(predicted.shape)}: "
+            "let the policy's preprocessor prepare the batch (make_pre_post_processors)"
+        )

@@ -1,11 +1,12 @@
 """What the configurations of this package's policies share: low-dimensional observations, fused Adam."""
 
+import math
 from dataclasses import dataclass, field
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_swr.configuration import check_dataset_folder, tells_bad_values
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
@@ -82,15 +83,22 @@ class StateConfig(PreTrainedConfig):
         return [key for key, ft in inputs.items() if ft.type in (FeatureType.STATE, FeatureType.ENV)]
 
     @property
+    def dimensions(self) -> dict[str, int]:
+        """Low-dimensional observations and action to how many numbers they are; a grid counts as a vector."""
+        features = {**(self.input_features or {}), **(self.output_features or {})}
+        keys = [*self.observation_keys, ACTION] if ACTION in features else self.observation_keys
+        return {key: math.prod(features[key].shape) for key in keys}
+
+    @property
     def observation_dim(self) -> int:
-        """Their dimensions together."""
-        inputs = self.input_features or {}
-        return sum(inputs[key].shape[0] for key in self.observation_keys)
+        """Dimensions of the observations together."""
+        dimensions = self.dimensions
+        return sum(dimensions[key] for key in self.observation_keys)
 
     @property
     def action_dim(self) -> int:
         """Dimension of the action."""
-        return self.action_feature.shape[0]  # type: ignore[union-attr]
+        return self.dimensions[ACTION]
 
     def get_optimizer_preset(self) -> OptimizerConfig:
         """Fused Adam."""
@@ -115,8 +123,8 @@ class StateConfig(PreTrainedConfig):
         """
         if self.robot_state_feature is None:
             raise ValueError(
-                f"policy {self.type!r} needs the feature {OBS_STATE!r}; the dataset has: "
-                f"{', '.join(self.input_features or {})} (rename the feature in the dataset)"
+                f"policy {self.type!r} needs the feature {OBS_STATE!r}; its inputs are: "
+                f"{', '.join(self.input_features or {}) or 'none'}"
             )
         if self.action_feature is None:
-            raise ValueError(f"policy {self.type!r} needs the feature 'action'; the dataset has none")
+            raise ValueError(f"policy {self.type!r} needs the feature {ACTION!r}; its outputs lack it")

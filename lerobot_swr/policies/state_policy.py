@@ -1,18 +1,21 @@
 """What this package's policies share: low-dimensional observations only, checkpoints that are checked."""
 
-import logging
-from typing import Any, Self, cast
+import json
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 from huggingface_hub import ModelCard
+from huggingface_hub.constants import CONFIG_NAME
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
 
+from lerobot_swr.dataset_checks import check_dimensions
 from lerobot_swr.policies.state_config import StateConfig
-
-logger = logging.getLogger(__name__)
+from lerobot_swr.policies.training_data import adopt_features
 
 INSTALL_HINT = """
 ## Install
@@ -27,28 +30,22 @@ class StatePolicy(PreTrainedPolicy):
 
     Args:
         config: The policy's configuration.
+        dataset_meta: Metadata of the training dataset; given when the policy is trained, absent at inference.
 
     Raises:
-        ValueError: If the dataset lacks ``observation.state`` or ``action``.
+        ValueError: If the dataset lacks ``observation.state`` or ``action``, or an input of the policy.
     """
 
     config_class = StateConfig
     name = "state"  # LeRobot wants one of every class; policies have their own
     config: StateConfig
 
-    def __init__(self, config: StateConfig):
+    def __init__(self, config: StateConfig, dataset_meta: LeRobotDatasetMetadata | None = None):
         super().__init__(config)
-        config.validate_features()
-        self._leave_out_images()
+        self._features_of = "environment" if dataset_meta is None else f"dataset {dataset_meta.root}"
+        adopt_features(config, dataset_meta)
         if config.flush_denormal:
             torch.set_flush_denormal(True)
-
-    def _leave_out_images(self) -> None:
-        images = list(self.config.image_features)
-        if images:
-            logger.warning("Policy %r does not look at images; left out: %s", self.name, ", ".join(images))
-            inputs = cast(dict, self.config.input_features)
-            self.config.input_features = {key: ft for key, ft in inputs.items() if key not in images}
 
     # --- Checkpoints ---
 
@@ -73,6 +70,8 @@ class StatePolicy(PreTrainedPolicy):
             for key in own.keys() & state.keys()
             if own[key].shape != state[key].shape
         ]
+        if misfits:
+            model._check_dimensions(Path(model_file).with_name(CONFIG_NAME))
         if missing or misfits:
             raise ValueError(
                 f"{model_file}: does not fit its config.json; missing: {missing}; misfits: {misfits}; "
@@ -80,6 +79,17 @@ class StatePolicy(PreTrainedPolicy):
             )
         model.load_state_dict(state, strict=False)
         return model
+
+    def _check_dimensions(self, stored_config: Path) -> None:
+        """Refuse a dataset or environment whose features have other dimensions than the checkpoint's."""
+        stored = json.loads(stored_config.read_text()) if stored_config.is_file() else {}
+        features = {**(stored.get("input_features") or {}), **(stored.get("output_features") or {})}
+        check_dimensions(
+            self._features_of,
+            {key: [d] for key, d in self.config.dimensions.items()},
+            {key: ft["shape"] for key, ft in features.items()},
+            "train a new policy on it",
+        )
 
     def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """The part of a checkpoint that is to be loaded into this policy."""

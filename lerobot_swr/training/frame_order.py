@@ -19,6 +19,7 @@ class FrameOrder(EpisodeAwareSampler):
         episodes: Episodes to train on; None takes all.
         seed: Seed of the run.
         batch_size: Frames per step.
+        places: Row of each frame among those of `episodes`, as LeRobot's dataset has it; None takes the row.
     """
 
     def __init__(
@@ -28,8 +29,9 @@ class FrameOrder(EpisodeAwareSampler):
         episodes: list[int] | None,
         seed: int,
         batch_size: int,
+        places: dict[int, int] | None = None,
     ):
-        super().__init__(list(starts), list(ends), episodes, shuffle=True, seed=seed)
+        super().__init__(list(starts), list(ends), episodes, 0, 0, True, seed, places)
         self.batch_size = batch_size
         self._rows = torch.tensor(self.indices)
         self._order: tuple[int, Tensor] | None = None

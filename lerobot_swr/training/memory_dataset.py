@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import chain
 from typing import Any
 from unittest.mock import patch
 
@@ -36,13 +37,15 @@ class MemoryDataset(Dataset):
                 f"dataset {dataset.repo_id!r} has {kept}, which do not fit into memory; use lerobot-train"
             )
         self.dataset = dataset
-        self._columns = _columns(dataset)
-        self._tasks = [str(name) for name in meta.tasks.index]
+        self._columns, self._texts = _columns(dataset)
+        self._tasks = [] if meta.tasks is None else list(meta.tasks.index)
         self._starts = torch.tensor(meta.episodes["dataset_from_index"])
         self._ends = torch.tensor(meta.episodes["dataset_to_index"])
-        # Row of every frame of the whole dataset, of which this one may hold some episodes only.
-        self._rows = torch.full((meta.total_frames,), -1)
-        self._rows[self._columns["index"]] = torch.arange(len(self._columns["index"]))
+        # Row of every frame of the whole dataset, where this one holds some episodes only.
+        self._rows = torch.arange(meta.total_frames)
+        places = dataset.absolute_to_relative_idx
+        if places is not None:
+            self._rows[list(places)] = torch.tensor(list(places.values()))
         deltas = dataset.reader.delta_indices or {}
         self._deltas = {key: torch.tensor(steps) for key, steps in deltas.items()}
 
@@ -71,16 +74,24 @@ class MemoryDataset(Dataset):
             batch[f"{key}_is_pad"] = (window < starts) | (window >= ends)
             batch[key] = self._columns[key][self._rows[window.clamp(starts, ends - 1)]]
         tasks = [self._tasks[index] for index in batch["task_index"].tolist()]
-        values = zip(*(value.unbind() for value in batch.values()), tasks, strict=True)
-        names = (*batch, "task")
+        texts = ([column[row] for row in rows] for column in self._texts.values())
+        values = zip(*(value.unbind() for value in batch.values()), *texts, tasks, strict=True)
+        names = (*batch, *self._texts, "task")
         return [dict(zip(names, one, strict=True)) for one in values]
 
 
-def _columns(dataset: LeRobotDataset) -> dict[str, Tensor]:
-    """All frames: feature to (F, ...), in the types that LeRobot gives them."""
+def _columns(dataset: LeRobotDataset) -> tuple[dict[str, Tensor], dict[str, list]]:
+    """All frames in the types that LeRobot gives them: feature to (F, ...), and feature to F strings."""
     frames = dataset.hf_dataset
     parts = [frames[first : first + ROWS_AT_ONCE] for first in range(0, len(frames), ROWS_AT_ONCE)]
-    return {key: torch.cat([torch.stack(part[key]) for part in parts]) for key in frames.column_names}
+    columns, texts = {}, {}
+    for key in frames.column_names:
+        values = list(chain.from_iterable(part[key] for part in parts))
+        if all(isinstance(value, Tensor) for value in values):
+            columns[key] = torch.stack(values)
+        else:
+            texts[key] = values
+    return columns, texts
 
 
 @contextmanager

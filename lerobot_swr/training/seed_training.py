@@ -9,8 +9,10 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.common.train_utils import should_save_checkpoint
+from lerobot.datasets import LeRobotDataset
 from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.utils.constants import ACTION
 from lerobot.utils.utils import init_logging
@@ -108,8 +110,9 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[],
     runs = SeedRuns(config, seeds, dataset.meta)
     episodes = dataset.meta.episodes
     starts, ends = episodes["dataset_from_index"], episodes["dataset_to_index"]
-    orders = [FrameOrder(starts, ends, dataset.episodes, seed, config.batch_size) for seed in seeds]
-    frames = _prepared_frames(runs)
+    places = dataset.absolute_to_relative_idx
+    orders = [FrameOrder(starts, ends, dataset.episodes, seed, config.batch_size, places) for seed in seeds]
+    frames = _prepared_frames(runs, dataset)
     bar = tqdm(
         total=config.steps * len(seeds),
         initial=runs.step * len(seeds),
@@ -159,19 +162,20 @@ def _steps_to_save(config: SeedsTrainConfig, step: int) -> int:
     return min(to_end, config.save_freq - step % config.save_freq) if config.save_freq > 0 else to_end
 
 
-def _prepared_frames(runs: SeedRuns) -> dict[str, Tensor]:
-    """All frames of the dataset as batches bring them to the policy: feature to (F, d), episode to (F,)."""
+def _prepared_frames(runs: SeedRuns, dataset: LeRobotDataset) -> dict[str, Tensor]:
+    """The dataset's frames as batches bring them, in its order: feature to (F, d), episode to (F,)."""
     policy = runs.policies[0]
     keys = [*policy.config.observation_keys, ACTION]
-    raw = {key: torch.from_numpy(policy.trajectories.columns[key]) for key in keys}
-    lengths = torch.from_numpy(policy.trajectories.lengths)
-    episodes = torch.repeat_interleave(torch.arange(len(lengths)), lengths)
-    prepared = runs.preprocessor(raw)
+    episodes, index = (dataset.hf_dataset.data.column(f"{key}index").to_numpy() for key in ("episode_", ""))
+    rows = policy.trajectories.rows_of(episodes)
+    columns = {key: policy.trajectories.columns[key] for key in keys}
+    if not np.array_equal(rows, np.arange(len(columns[ACTION]))):
+        columns = {key: column[rows] for key, column in columns.items()}
+    prepared = runs.preprocessor({key: torch.from_numpy(column) for key, column in columns.items()})
     frames = {key: prepared[key] for key in keys}
-    device, rows = frames[ACTION].device, torch.arange(len(episodes))
-    places = rows - torch.from_numpy(policy.trajectories.starts)[episodes]
-    frames["timestamp"] = (places / policy.trajectories.fps).to(device)
-    return {**frames, "episode_index": episodes.to(device), "index": rows.to(device)}
+    device = frames[ACTION].device
+    numbers = {"episode_index": episodes, "index": index}
+    return {**frames, **{key: torch.from_numpy(value.copy()).to(device) for key, value in numbers.items()}}
 
 
 def _draw(

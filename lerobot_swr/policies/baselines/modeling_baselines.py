@@ -7,9 +7,11 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
+from lerobot_swr.dataset_statistics import Statistics
 from lerobot_swr.policies.baselines.averaging import moving_average
 from lerobot_swr.policies.baselines.configuration_baselines import (
     BesoConfig,
@@ -27,10 +29,11 @@ from lerobot_swr.policies.baselines.transformers import (
     Trunk,
     WindowGPT,
 )
-from lerobot_swr.policies.network import ObservationEncoder
-from lerobot_swr.policies.processor_swr import Statistics
+from lerobot_swr.policies.network import ObservationEncoder, check_same_shape
 from lerobot_swr.policies.state_policy import StatePolicy
+from lerobot_swr.policies.training_data import read_training_data
 from lerobot_swr.sampling import StepGenerator
+from lerobot_swr.trajectories import Trajectories
 
 PAD = f"{OBS_STATE}_is_pad"
 ACTION_PAD = f"{ACTION}_is_pad"
@@ -45,20 +48,26 @@ class WindowDiffusionPolicy(StatePolicy):
 
     Args:
         config: The policy's configuration.
-        dataset_stats: Statistics of the training dataset, for the bounds of the actions; absent at inference.
-        **kwargs: Whatever else LeRobot's factory passes (``dataset_meta``).
+        dataset_meta: Metadata of the training dataset; given when the policy is trained, absent at inference.
+        **kwargs: Whatever else LeRobot's factory passes (``dataset_stats``).
 
     Raises:
         ModuleNotFoundError: If diffusers is not installed.
-        ValueError: If the dataset lacks ``observation.state`` or ``action``.
+        ValueError: If the dataset lacks ``observation.state`` or ``action``, or their data or statistics are
+            not usable.
     """
 
     config_class = WindowDiffusionConfig
     name = "window_diffusion"  # LeRobot wants one of every class; policies have their own
     config: WindowDiffusionConfig
 
-    def __init__(self, config: WindowDiffusionConfig, dataset_stats: Statistics | None = None, **kwargs: Any):
-        super().__init__(config)
+    def __init__(
+        self,
+        config: WindowDiffusionConfig,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+        **kwargs: Any,
+    ):
+        super().__init__(config, dataset_meta)
         self.encoder = ObservationEncoder(config.observation_keys)
         self.network = self._make_network()
         self.average = moving_average(self.network, config.ema_decay)
@@ -68,9 +77,9 @@ class WindowDiffusionPolicy(StatePolicy):
         self.action_high: Tensor
         self.register_buffer("action_low", torch.full((config.action_dim,), -torch.inf))
         self.register_buffer("action_high", torch.full((config.action_dim,), torch.inf))
-        self._has_dataset = dataset_stats is not None
-        if dataset_stats is not None:
-            self._set_bounds(dataset_stats)
+        self._has_dataset = dataset_meta is not None
+        if dataset_meta is not None:
+            self._set_bounds(read_training_data(config, dataset_meta), dataset_meta.stats)
         self.reset()
 
     @abstractmethod
@@ -86,13 +95,14 @@ class WindowDiffusionPolicy(StatePolicy):
     def _n_actions(self) -> int:
         """K, actions that are denoised together."""
 
-    def _set_bounds(self, stats: Statistics) -> None:
+    def _set_bounds(self, trajectories: Trajectories, stats: Statistics | None) -> None:
         """Remember the range of the demonstrations' normalised actions."""
         normalize, _ = make_beso_pre_post_processors(self.config, stats)
-        keys = [*self.config.observation_keys, ACTION]
-        for bound, extreme in ((self.action_low, "min"), (self.action_high, "max")):
-            raw = {key: torch.as_tensor(stats[key][extreme], dtype=torch.float32) for key in keys}
-            bound.copy_(normalize(raw)[ACTION].reshape(-1))
+        columns = {key: torch.from_numpy(trajectories.columns[key]) for key in self.config.dimensions}
+        ends = {key: torch.stack([value.amin(dim=0), value.amax(dim=0)]) for key, value in columns.items()}
+        low, high = normalize(ends)[ACTION]
+        self.action_low.copy_(low)
+        self.action_high.copy_(high)
 
     # --- LeRobot's training interface ---
 
@@ -118,6 +128,7 @@ class WindowDiffusionPolicy(StatePolicy):
             noised: Noised = self.process.noised(actions)
             network = self.network if self.training else self.average
             predicted = network(self.encoder(batch), noised.inputs, noised.level, batch[PAD])
+        check_same_shape(predicted, noised.target)
         errors = (predicted - noised.target).square().mean(dim=-1)  # (B, K)
         losses = (errors * ~batch[ACTION_PAD]).mean(dim=-1)
         return (losses if reduction == "none" else losses.mean()), {}
