@@ -111,6 +111,31 @@ def test_offline_errors_are_smallest_for_the_own_style(run_command, trained_zbc,
     assert (tmp_path / "offline.png").exists()
 
 
+def test_offline_evaluation_keeps_to_the_styles_that_may_be_drawn(
+    run_command, trained_zbc, small_maze, small_maze_meta, tmp_path, capsys
+):
+    """A filter chooses the episodes, and among them the nearest and the random other style."""
+    lengths = load_trajectories(small_maze_meta, ["observation.state"]).lengths
+    middle = int(np.median(lengths))
+    chosen = np.flatnonzero(lengths > middle)
+    policy = f"--policy.style_filter=length > {middle}"
+    result = evaluate(run_command, trained_zbc, small_maze, tmp_path / "some", policy)
+    assert result["n_episodes"] == len(chosen)
+    assert result["n_frames"] == lengths[chosen].sum()
+    listed = f"--policy.style_episodes=[{','.join(map(str, chosen))}]"
+    assert (
+        evaluate(run_command, trained_zbc, small_maze, tmp_path / "same", listed)["action_error"]
+        == (result["action_error"])
+    )
+    by_number = f"--dataset.episodes=[{','.join(map(str, chosen))}]"  # of all styles
+    everything = evaluate(run_command, trained_zbc, small_maze, tmp_path / "all", by_number)
+    assert everything["action_error"]["own"] == pytest.approx(result["action_error"]["own"])
+    for flag in ("style_sampling=fixed", "style_interpolate=[0,1,0.5]"):
+        with pytest.raises(SystemExit):
+            evaluate(run_command, trained_zbc, small_maze, tmp_path / "out", f"--policy.{flag}")
+        assert "this is about rollouts in an environment" in capsys.readouterr().err
+
+
 def test_offline_evaluation_of_bc_has_no_styles(
     run_command, make_tiny_policy, small_maze, small_maze_meta, tmp_path
 ):

@@ -24,11 +24,13 @@ from lerobot.utils.utils import init_logging
 from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.eval_options import EvalCommand
+from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, path_of, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
+    check_environment,
     load_checkpoint,
     load_demonstrations,
     load_reference,
@@ -45,6 +47,8 @@ from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
 from lerobot_swr.evaluation.robustness import format_robustness, run_robustness
 from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactual, plot_length_control
 from lerobot_swr.trajectories import Trajectories
+
+TEXT_FLAGS = ("behavior_rule", "policy.style_filter")
 
 
 @parser.wrap()
@@ -119,10 +123,15 @@ def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
     if cfg.policy is None:
         trajectories = load_demonstrations(cfg.dataset.metadata())
         sampling = cfg.style_sampling or "uniform"
+        assert cfg.env is not None
+        shapes = {key: column.shape[1:] for key, column in trajectories.columns.items()}
+        check_environment(cfg.env, shapes, {}, "the dataset")
         playback = playback_checkpoint(trajectories, sampling, cfg.dataset.episodes)  # type: ignore[arg-type]
         return playback, trajectories
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
-    return checkpoint, load_reference(cfg.dataset, checkpoint)
+    if cfg.env is not None:
+        check_environment(cfg.env, checkpoint.shapes, cfg.rename_map, "the checkpoint")
+    return checkpoint, load_reference(cfg.dataset, checkpoint, needs_actions=cfg.env is None)
 
 
 def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories, title: str) -> None:
@@ -179,4 +188,5 @@ def main() -> None:
     """Entry point."""
     init_logging()
     register_third_party_plugins()
+    sys.argv = list(with_literal_text(sys.argv, TEXT_FLAGS))
     evaluate()

@@ -20,6 +20,7 @@ CONFLICTS = {
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),
     *("style_sampling", "behavior_rule", "n_episodes", "batch_size"),
+    *("policy.style_sampling", "policy.style_interpolate"),
 )
 
 

@@ -8,6 +8,7 @@ from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
 
 from lerobot_swr.cli.eval_conflicts import refuse_conflicts
+from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.styles import check_style_sampling
 
@@ -85,7 +86,8 @@ class EvalCommand:
             "dataset.episodes": self.dataset.episodes is not None,
             "rename_map": bool(self.rename_map),
             "baseline": self.baseline is not None,
-            "policy.style_sampling": any(o.startswith("--style_sampling") for o in _policy_overrides()),
+            "policy.style_sampling": _overrides("style_sampling"),
+            "policy.style_interpolate": _overrides("style_interpolate"),
             "policy.*": self.policy is not None or bool(_policy_overrides()),
         }
         refuse_conflicts([key for key, is_given in given.items() if is_given], self.env is not None)
@@ -113,15 +115,16 @@ class EvalCommand:
             return
         if not path:
             raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
+        check_checkpoint_path(path)
         if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
             raise ValueError(
                 f"policy.path={path!r}: no config.json in this folder; "
                 "give a checkpoint's pretrained_model folder"
             )
         overrides = _policy_overrides()
-        if self.robustness and not any(option.startswith("--style_sampling") for option in overrides):
+        if self.robustness and not _overrides("style_sampling"):
             self.style_sampling = self.style_sampling or "stratified"
-        self.policy = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+        self.policy = _stored_config(path, overrides)
         self.policy.pretrained_path = Path(path)
         if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
             self.policy.style_sampling = self.style_sampling
@@ -130,6 +133,22 @@ class EvalCommand:
     def __get_path_fields__(cls) -> list[str]:
         """Keys that LeRobot's parser loads from a folder."""
         return ["policy"]
+
+
+def _stored_config(path: str, overrides: list[str]) -> PreTrainedConfig:
+    try:
+        return PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
+    except OSError as error:
+        if Path(path).is_dir():
+            raise
+        raise FileNotFoundError(
+            f"policy.path={path!r}: neither a folder here nor found on the Hub; check the spelling"
+        ) from error
+
+
+def _overrides(key: str) -> bool:
+    """Whether ``--policy.<key>`` is given."""
+    return any(option.partition("=")[0] == f"--{key}" for option in _policy_overrides())
 
 
 def _policy_overrides() -> list[str]:

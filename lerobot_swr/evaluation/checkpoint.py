@@ -6,10 +6,14 @@ from typing import Any
 
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.envs import EnvConfig
+from lerobot.envs.utils import env_to_policy_features
 from lerobot.policies import make_pre_post_processors
 from lerobot.policies.factory import get_policy_class
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_PREFIX, OBS_STATE
 
+from lerobot_swr.dataset_checks import Shapes, check_dimensions, check_format, describe_features
+from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 
@@ -27,7 +31,8 @@ class DatasetSource:
         """Metadata of the dataset, whose low-dimensional data are then on this machine.
 
         Raises:
-            ValueError: If neither `root` nor `repo_id` is given, or an episode does not exist.
+            ValueError: If neither `root` nor `repo_id` is given, an episode does not exist, or this LeRobot
+                does not read the dataset's format.
             FileNotFoundError: If `root` holds no dataset.
         """
         if self.root is None and self.repo_id is None:
@@ -37,6 +42,7 @@ class DatasetSource:
                 f"dataset.root={str(self.root)!r}: no LeRobot dataset there (no meta/info.json); "
                 "check the path, or make one with lerobot-swr-dataset"
             )
+        check_format(self.root or HF_LEROBOT_HOME / str(self.repo_id), self.repo_id)
         if self.root is not None:
             meta = LeRobotDatasetMetadata(self.repo_id or f"local/{self.root.name}", root=self.root)
         else:
@@ -65,6 +71,13 @@ class Checkpoint:
     policy: Any
     preprocessor: Any
     postprocessor: Any
+
+    @property
+    def shapes(self) -> Shapes:
+        """Low-dimensional inputs and outputs of the policy to their shapes."""
+        config = self.policy.config
+        features = {**config.input_features, **config.output_features}
+        return {key: ft.shape for key, ft in features.items() if ft.type is not FeatureType.VISUAL}
 
     @property
     def has_styles(self) -> bool:
@@ -99,43 +112,77 @@ def load_checkpoint(config: PreTrainedConfig, rename_map: dict[str, str] | None 
 
 
 def load_demonstrations(meta: LeRobotDatasetMetadata) -> Trajectories:
-    """A dataset's observations and actions, without pictures."""
-    return load_trajectories(meta, [key for key, ft in meta.features.items() if _is_low_dimensional(key, ft)])
+    """A dataset's states and actions, and its other low-dimensional observations that are usable."""
+    return load_trajectories(meta, [OBS_STATE, ACTION], _low_dimensional(meta))
 
 
-def load_reference(source: DatasetSource, checkpoint: Checkpoint) -> Trajectories:
-    """The demonstrations that a checkpoint is compared with: observations and, where present, actions.
+def load_reference(
+    source: DatasetSource, checkpoint: Checkpoint, needs_actions: bool = False
+) -> Trajectories:
+    """The demonstrations that a checkpoint is compared with: what it looks at, and what else is usable.
+
+    Args:
+        source: The dataset.
+        checkpoint: The policy.
+        needs_actions: Whether actions have to be there.
 
     Raises:
-        ValueError: If a style policy was trained on another dataset: its styles belong to episodes that are
-            not in this one.
+        ValueError: If a style policy was trained on another dataset, whose episodes its styles belong to, or
+            the dataset lacks what the policy looks at, or has it in other dimensions.
     """
     meta = source.metadata()
-    keys = [key for key, ft in meta.features.items() if _is_low_dimensional(key, ft)]
-    config = checkpoint.policy.config
-    needed = [key for key, ft in config.input_features.items() if ft.type is not FeatureType.VISUAL]
-    absent = [key for key in [*needed, OBS_STATE] if key not in keys]
+    where, config = f"dataset.root={str(meta.root)!r}", checkpoint.policy.config
+    policy = checkpoint.shapes
+    found = _low_dimensional(meta)
+    needed = [key for key in policy if key != ACTION or needs_actions]
+    absent = [key for key in dict.fromkeys([*needed, OBS_STATE]) if key not in found]
     if absent:
-        raise ValueError(
-            f"dataset.root={str(meta.root)!r} lacks {absent}, which the policy looks at; it has {keys}"
-        )
-    trajectories = load_demonstrations(meta)
+        has = describe_features(meta.features)
+        raise ValueError(f"{where} lacks {', '.join(absent)}, which the policy looks at; it has: {has}")
+    shapes = {key: ft["shape"] for key, ft in meta.features.items()}
+    check_dimensions(where, shapes, policy, "give the dataset that it was trained on")
+    trajectories = load_trajectories(meta, list(dict.fromkeys([*needed, OBS_STATE])), found)
     known = getattr(config, "dataset_fingerprint", None)
     if checkpoint.has_styles and known is not None:
         if len(trajectories) != config.num_episodes:
             raise ValueError(
-                f"dataset.root={str(meta.root)!r} has {len(trajectories)} episodes, but the checkpoint has "
-                f"styles of {config.num_episodes}; give the dataset that it was trained on"
+                f"{where} has {len(trajectories)} episodes, but the checkpoint has styles of "
+                f"{config.num_episodes}; give the dataset that it was trained on"
             )
         if trajectories.fingerprint([OBS_STATE]) != known:
             raise ValueError(
-                f"dataset.root={str(meta.root)!r} is not the dataset that the checkpoint was trained on (its "
-                "states differ); give that one, so that styles and episodes belong together"
+                f"{where} is not the dataset that the checkpoint was trained on (its states differ); give "
+                "that one, so that styles and episodes belong together"
             )
     return trajectories
 
 
-def _is_low_dimensional(key: str, feature: dict) -> bool:
-    return (key.startswith("observation.") or key == "action") and feature["dtype"].startswith(
-        ("float", "int")
+def check_environment(env_cfg: EnvConfig, shapes: Shapes, rename_map: dict[str, str], owner: str) -> None:
+    """Refuse an environment whose features have other dimensions than those of a policy.
+
+    Args:
+        env_cfg: The environment.
+        shapes: Feature to shape, as the policy has it.
+        rename_map: Observation to the policy's name of it.
+        owner: What the shapes belong to.
+
+    Raises:
+        ValueError: Naming the feature and both shapes.
+    """
+    given = {rename_map.get(key, key): ft for key, ft in env_to_policy_features(env_cfg).items()}
+    check_dimensions(
+        f"env.type={env_cfg.type!r}, env.task={env_cfg.task!r}",
+        {key: ft.shape for key, ft in given.items() if ft.type is not FeatureType.VISUAL},
+        shapes,
+        "choose the environment that belongs to it",
+        owner,
     )
+
+
+def _low_dimensional(meta: LeRobotDatasetMetadata) -> list[str]:
+    """Names of the observations and actions that are numbers."""
+    return [
+        key
+        for key, ft in meta.features.items()
+        if (key.startswith(OBS_PREFIX) or key == ACTION) and is_numeric(ft)
+    ]

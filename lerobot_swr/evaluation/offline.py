@@ -27,7 +27,7 @@ class OfflineResult:
     """What ``offline.json`` holds.
 
     Attributes:
-        n_episodes: Episodes evaluated: those that were trained on, for a style policy.
+        n_episodes: Episodes evaluated: those whose styles may be drawn, for a style policy.
         n_frames: Their frames.
         action_error: Kind of style (``own``, ``nearest``, ``random``, or ``none`` for a policy without
             styles) to the mean over frames of the squared error of the normalised action, itself a mean over
@@ -66,7 +66,7 @@ def frame_errors(
     Args:
         checkpoint: A ``bc``, ``zbc`` or ``wzbc`` policy.
         trajectories: The dataset it was trained on.
-        episodes: Only these; None takes all (of those trained on, for a style policy).
+        episodes: Only these; None takes all (of those whose styles may be drawn, for a style policy).
         seed: Seed of the random styles, one draw per frame.
 
     Raises:
@@ -82,24 +82,25 @@ def frame_errors(
     styles: dict[str, np.ndarray | None] = {"none": None}
     if isinstance(policy, ZBCPolicy):
         # Styles added for episodes of other datasets follow those of the training dataset.
-        trained = policy.styles.trained.bool().cpu().numpy()[: len(trajectories)]
-        if trained.sum() < 2:
+        allowed = policy.styles.allowed().cpu().numpy()
+        drawable = np.sort(allowed[allowed < len(trajectories)])
+        if len(drawable) < 2:
             raise ValueError(
-                f"the checkpoint has {trained.sum()} trained style(s); offline evaluation compares an "
-                "episode's own style with another one and needs at least 2"
+                f"the checkpoint has {len(drawable)} style(s) that may be drawn; offline evaluation compares "
+                "an episode's own style with another one and needs at least 2"
             )
-        chosen = chosen[trained[chosen]]
+        chosen = chosen[np.isin(chosen, drawable)]
         if len(chosen) == 0:
             raise ValueError(
-                f"dataset.episodes={episodes}: none of them was trained on, so none has a style; "
-                f"trained were {np.flatnonzero(trained).tolist()}"
+                f"dataset.episodes={episodes}: none of them has a style that may be drawn; these have: "
+                f"{drawable.tolist()}"
             )
     frames = np.concatenate(
         [trajectories.starts[i] + np.arange(trajectories.lengths[i]) for i in chosen]
     )  # (F,) rows
     episode_of_frame = np.repeat(chosen, trajectories.lengths[chosen])
     if isinstance(policy, ZBCPolicy):
-        styles = _styles_of_frames(policy, trajectories, np.flatnonzero(trained), episode_of_frame, seed)
+        styles = _styles_of_frames(policy, trajectories, drawable, episode_of_frame, seed)
     squared = {kind: _squared_errors(checkpoint, trajectories, frames, used) for kind, used in styles.items()}
     place = frames - trajectories.starts[episode_of_frame]
     phase = place / np.maximum(trajectories.lengths[episode_of_frame] - 1, 1)
@@ -107,15 +108,15 @@ def frame_errors(
 
 
 def _styles_of_frames(
-    policy: ZBCPolicy, trajectories: Trajectories, trained: np.ndarray, own: np.ndarray, seed: int
+    policy: ZBCPolicy, trajectories: Trajectories, drawable: np.ndarray, own: np.ndarray, seed: int
 ) -> dict[str, np.ndarray | None]:
     """Kind of style to the (F,) episodes whose styles the frames use."""
     distances = pairwise_distances(trajectories.states(policy.compared_keys()))
     np.fill_diagonal(distances, np.inf)
-    nearest = trained[distances[:, trained].argmin(axis=1)]  # (N,)
-    place = np.searchsorted(trained, own)
-    shift = np.random.default_rng(seed).integers(1, len(trained), size=len(own))
-    return {"own": own, "nearest": nearest[own], "random": trained[(place + shift) % len(trained)]}
+    nearest = drawable[distances[:, drawable].argmin(axis=1)]  # (N,)
+    place = np.searchsorted(drawable, own)
+    shift = np.random.default_rng(seed).integers(1, len(drawable), size=len(own))
+    return {"own": own, "nearest": nearest[own], "random": drawable[(place + shift) % len(drawable)]}
 
 
 @torch.no_grad()

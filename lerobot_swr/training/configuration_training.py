@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+from lerobot.configs import parser
 from lerobot.configs.train import TrainPipelineConfig
 
+from lerobot_swr.configuration import check_checkpoint_path, check_dataset_folder
 from lerobot_swr.policies.configuration_swr import BCConfig
 
 OPTIONS_FILE = "seeds_train_config.json"
@@ -35,6 +37,10 @@ class SeedsTrainConfig(TrainPipelineConfig):
             ValueError: For an option that only ``lerobot-train`` has, or a bad value.
             FileExistsError: If the output folder exists and ``resume`` is not set.
         """
+        check_dataset_folder()
+        path = parser.get_path_arg("policy")
+        if path is not None:
+            check_checkpoint_path(path)
         # LeRobot resumes one run from its config_path; this command finds its runs in output_dir.
         new_run = self._as_plain(resume=False, output_dir=None)
         new_run.validate()
