@@ -9,7 +9,10 @@ into functions of a row; nothing is ever evaluated as Python.
 """
 
 import ast
+import io
+import keyword
 import operator
+import tokenize
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -33,6 +36,12 @@ _OPERATORS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
     ast.In: lambda item, container: item in container,
     ast.NotIn: lambda item, container: item not in container,
 }
+# Python's keywords that no expression contains: the style table has a column called "return".
+_STATEMENT_WORDS = frozenset(keyword.kwlist) - {
+    *("and", "or", "not", "in", "is", "True", "False", "None"),
+    *("if", "else", "for", "lambda", "await", "async", "yield"),
+}
+_MARK = "\u01c3"  # a letter that begins no name
 _ORDERING = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 
 
@@ -71,18 +80,44 @@ def parse_filter(text: str) -> ast.expr:
     if len(text) > MAX_CHARACTERS:
         raise FilterError(f"style_filter={text[:40]!r}...: {len(text)} characters; allowed: {MAX_CHARACTERS}")
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
+        tree = ast.parse(_with_plain_names(text.strip()), mode="eval").body
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else "it cannot be parsed"
         raise FilterError(
             f"style_filter={text!r}: {reason}; expected e.g. \"70 <= length <= 80 and behavior == '6410'\""
         ) from error
     level = [tree]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            node.id = node.id.removeprefix(_MARK)
     for _ in range(MAX_DEPTH):
         level = [child for node in level for child in ast.iter_child_nodes(node)]  # type: ignore[misc]
         if not level:
             return tree
     raise FilterError(f"style_filter={text!r}: nested deeper than {MAX_DEPTH} levels; simplify it")
+
+
+def names_in(text: str) -> set[str]:
+    """The columns that a filter looks at.
+
+    Raises:
+        FilterError: If the text is no filter.
+    """
+    return {node.id for node in ast.walk(parse_filter(text)) if isinstance(node, ast.Name)}
+
+
+def _with_plain_names(text: str) -> str:
+    """The text with a mark before words that begin a statement in Python, such as ``return``: names here."""
+    try:
+        tokens = list(tokenize.generate_tokens(io.StringIO(text).readline))
+    except tokenize.TokenError:
+        return text  # the parser says what is wrong
+    words = [token for token in tokens if token.type == tokenize.NAME and token.string in _STATEMENT_WORDS]
+    lines = text.splitlines(keepends=True)
+    for token in reversed(words):
+        row, column = token.start
+        lines[row - 1] = f"{lines[row - 1][:column]}{_MARK}{lines[row - 1][column:]}"
+    return "".join(lines)
 
 
 def column_kind(values: Sequence[Value]) -> Kind:

@@ -59,6 +59,15 @@ def demonstration_paths(trajectories: Trajectories, episodes: list[int]) -> list
     return paths
 
 
+def as_script(data: Any) -> str:
+    """Data as an expression that may stand in a page's script element, whatever strings it holds.
+
+    There, ``</script`` and ``<!--`` mean something even within a string.
+    """
+    text = json.dumps(data)  # all ASCII
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+
 def write_style_map(
     path: Path,
     styles: np.ndarray,
@@ -95,8 +104,7 @@ def write_style_map(
         "path_axes": ["state 0", "state 1"] if plane else ["states, PC 1", "states, PC 2"],
     }
     page = files("lerobot_swr").joinpath("style_map.html").read_text(encoding="utf-8")
-    # "</" would end the script element; JSON allows the escaped form.
-    page = page.replace("/*DATA*/", json.dumps(data).replace("</", "<\\/"))
-    page = page.replace("/*PLOTLY*/", get_plotlyjs())
+    before, after = page.split("/*DATA*/")
+    page = before.replace("/*PLOTLY*/", get_plotlyjs()) + as_script(data) + after
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page, encoding="utf-8")

@@ -7,7 +7,7 @@ It is made from the training dataset when a policy is created and travels with t
 import json
 import logging
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,7 @@ from lerobot_swr.trajectories import Trajectories
 TABLE_FILE = "styles.json"
 SUCCESS = "next.success"
 OUTCOMES = (REWARD, SUCCESS)
+OUTCOME_COLUMNS = frozenset({"return", "success"})
 MAX_NEIGHBOURS = 50
 
 Metric = Callable[[Mapping[str, np.ndarray]], Value]
@@ -80,6 +81,10 @@ class StyleTable:
         if name not in self.filters:
             raise ValueError(f"{name!r} is no named filter; known: {', '.join(self.filters) or 'none'}")
         return replace(self, filters={key: text for key, text in self.filters.items() if key != name})
+
+    def without_columns(self, names: Collection[str]) -> "StyleTable":
+        """The table without some of its columns."""
+        return replace(self, columns={key: v for key, v in self.columns.items() if key not in names})
 
     def extended(self, other: "StyleTable") -> "StyleTable":
         """The table with the rows of `other` below, which has the same columns; filters are this table's."""
@@ -154,7 +159,10 @@ def nearest_others(distances: np.ndarray) -> list[list[int]]:
 def _measured(name: str, metric: Metric, trajectories: Trajectories) -> list[Value]:
     values: list[Value] = []
     for i, episode in enumerate(trajectories.episodes()):
-        value: Any = metric(episode)
+        try:
+            value: Any = metric(episode)
+        except Exception as error:  # whatever a user's function raises
+            raise ValueError(f"style_metrics: {name!r} fails on episode {i}: {error!r}") from error
         value = value.item() if isinstance(value, np.generic | np.ndarray) and np.size(value) == 1 else value
         if not isinstance(value, bool | int | float | str) or value != value or value in (np.inf, -np.inf):
             raise ValueError(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_swr.filters import FilterError, parse_filter, select
+from lerobot_swr.filters import FilterError, names_in, parse_filter, select
 
 TABLE = {
     "length": [62.0, 70.0, 75.0, 80.0, 101.0],
@@ -187,3 +187,29 @@ def test_syntax_can_be_checked_without_a_table():
     parse_filter("anything > 3")
     with pytest.raises(FilterError, match=r"expected e\.g\."):
         parse_filter("anything >")
+
+
+@pytest.mark.parametrize(
+    ("text", "kept"),
+    [
+        ("return > 10", [1]),
+        ("2 < return <= 20 and task != 'return'", [1]),
+        ("'return' in task or return == 1", [0, 2]),
+        ("(return\n > 10)", [1]),
+    ],
+)
+def test_a_column_may_be_called_like_a_statement(text, kept):
+    """The table has one called return, which Python keeps for itself; strings stay as they are."""
+    table = {"return": [1.0, 20.0, 3.0], "task": ["a", "b", "return"]}
+    assert np.flatnonzero(select(text, table)).tolist() == kept
+    assert names_in(text) == {"return"} | ({"task"} if "task" in text else set())
+
+
+def test_a_statement_is_no_filter():
+    """An unknown one is told under its own name."""
+    for text, message in (
+        ("return 1", "invalid syntax"),
+        ("class > 3", "unknown name 'class'; known: length"),
+    ):
+        with pytest.raises(FilterError, match=message):
+            select(text, {"length": [1.0]})

@@ -1,19 +1,25 @@
 """Styles for new demonstrations: the optimum, the enlarged checkpoint, the held-out loss."""
 
 import hashlib
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch
 from conftest import make_batch, save_checkpoint
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import make_policy
+from lerobot.policies.factory import make_policy_config
+from odd_datasets import PLAIN, arcs, feature, metadata, write
 from torch import nn
 
 from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.policies import style_extension
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
 from lerobot_swr.style_encoding import encode_styles
+from lerobot_swr.style_table import load_style_table
 
 
 class Additive(nn.Module):
@@ -161,3 +167,61 @@ def test_encoding_is_deterministic(make_tiny_policy):
     starts = policy.styles.embedding.weight.detach()[None, :2]
     once, again = (encode_styles(policy.network, [frames], starts, steps=10)[0] for _ in range(2))
     assert np.array_equal(once.numpy(), again.numpy())
+
+
+REWARDED = {**PLAIN, "next.reward": feature(1), "next.success": feature(1, dtype="bool")}
+
+
+def rewarded(i, t, n):
+    """A frame of an arc with rewards that sum up to its number."""
+    return {
+        **arcs(i, t, n),
+        "next.reward": np.array([i / n], np.float32),
+        "next.success": np.array([t == n - 1]),
+    }
+
+
+@pytest.fixture
+def rewarded_checkpoint(tmp_path):
+    """A checkpoint trained on arcs with rewards, and the dataset."""
+    root = write(tmp_path / "data", REWARDED, rewarded)
+    config = make_policy_config("zbc", hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False)
+    meta = metadata(root)
+    return checkpoint(make_policy(config, ds_meta=meta), meta, tmp_path / "old", [0, 1, 2, 3]), root
+
+
+def test_demonstrations_with_rewards_are_added_with_their_outcomes(
+    rewarded_checkpoint, tmp_path, run_command, capsys
+):
+    """The columns return and success go on, and can be filtered by name."""
+    folder, root = rewarded_checkpoint
+    new = write(tmp_path / "more", REWARDED, lambda i, t, n: rewarded(i + 4, t, n), lengths=(5, 9))
+    run_command(
+        styles_command.main, folder, f"--add={new}", f"--dataset.root={root}", f"--output_dir={root}_new"
+    )
+    table = load_style_table(f"{root}_new")
+    np.testing.assert_allclose(table.columns["return"], range(6), rtol=1e-5)
+    assert table.columns["success"] == [True] * 6
+    run_command(styles_command.main, f"{root}_new", "--filter=return > 3.5 and success")
+    assert "2 of 6 demonstrations: 4, 5" in capsys.readouterr().out
+
+
+def test_demonstrations_without_rewards_cost_the_column_unless_a_filter_needs_it(
+    rewarded_checkpoint, tmp_path, run_command, capsys
+):
+    """In the new checkpoint only; what a named filter looks at is refused before anything is encoded."""
+    folder, root = rewarded_checkpoint
+    new = write(tmp_path / "more", lengths=(5, 9))
+    flags = [f"--dataset.root={root}", f"--add={new}"]
+    run_command(styles_command.main, folder, *flags, f"--output_dir={root}_new")
+    assert "return" not in load_style_table(f"{root}_new").columns
+    assert "return" in load_style_table(folder).columns
+    run_command(styles_command.main, folder, "--filter=return > 1", "--name=well")
+    with (
+        patch.object(style_extension, "encode_styles", side_effect=AssertionError("encoded")),
+        pytest.raises(SystemExit),
+    ):
+        run_command(styles_command.main, folder, *flags, f"--output_dir={root}_other")
+    assert "['return', 'success'] of the checkpoint's table, which the named filters ['well']" in (
+        capsys.readouterr().err
+    )

@@ -1,7 +1,10 @@
 """The interactive map: its projections, its page, and what a real browser makes of it."""
 
+import json
 import shutil
 import subprocess
+from html.parser import HTMLParser
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -9,7 +12,8 @@ import torch
 from conftest import make_batch, save_checkpoint
 
 from lerobot_swr.cli import styles as styles_command
-from lerobot_swr.style_map import demonstration_paths, principal_components
+from lerobot_swr.style_map import as_script, demonstration_paths, principal_components, write_style_map
+from lerobot_swr.style_table import StyleTable
 from lerobot_swr.trajectories import load_trajectories
 
 
@@ -56,6 +60,33 @@ def test_the_page_needs_no_network(page):
     assert "/*PLOTLY*/" not in text
     assert "http" not in head
     assert "src=" not in head
+
+
+HOSTILE = "</script><!--<script> /*PLOTLY*/ & <b>bold</b> \u2028 ' \" `${x}`"
+
+
+def test_no_string_of_the_data_ends_the_script(tmp_path):
+    """A task in any markup is data: a parser finds two scripts, the second with exactly that string."""
+    table = StyleTable({"length": [3, 4, 5], "task": [HOSTILE, "<!--<script>", "plain"]}, [[], [], []])
+    page = tmp_path / "map.html"
+    write_style_map(page, np.random.default_rng(0).normal(size=(3, 4)), [0, 1, 2], table, None, HOSTILE)
+
+    class Scripts(HTMLParser):
+        found: ClassVar[list[str]] = []
+
+        def handle_data(self, data):
+            if self.lasttag == "script" and data.strip():
+                self.found.append(data)
+
+    text = page.read_text()
+    Scripts().feed(text)
+    scripts = [part for part in Scripts.found if "const data = " in part]
+    assert len(scripts) == 1
+    line = scripts[0].split("const data = ")[1].splitlines()[0].rstrip(";")
+    assert json.loads(line)["columns"]["task"] == table.columns["task"]
+    assert json.loads(line)["title"] == HOSTILE
+    assert not {"<", ">", "&"} & set(as_script(HOSTILE))
+    assert text.count("<!--") == text.split("const data")[0].count("<!--")
 
 
 def test_a_browser_draws_the_map_and_gives_the_flag(page):

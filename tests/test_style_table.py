@@ -29,6 +29,11 @@ def last_y(episode) -> float:
     return episode["observation.state"][-1, 1]
 
 
+def failing(episode):
+    """A metric of a feature that is not there."""
+    return episode["observation.x"].sum()
+
+
 def broken(episode) -> float:
     """A user metric that is not finite."""
     return float("nan")
@@ -287,6 +292,10 @@ def test_bad_metrics_and_damaged_tables_are_named(make_tiny_policy, checkpoint):
     """A metric that is not finite, one that does not exist, a truncated file, another checkpoint's."""
     with pytest.raises(ValueError, match="style_metrics: 'broken' of episode 0 is nan"):
         make_tiny_policy("zbc", style_metrics=f"{__name__}:broken")
+    with pytest.raises(
+        ValueError, match=r"style_metrics: 'failing' fails on episode 0: KeyError\('observation.x'\)"
+    ):
+        make_tiny_policy("zbc", style_metrics=f"{__name__}:failing")
     with pytest.raises(ValueError, match="style_metrics='nowhere:metric'"):
         make_tiny_policy("zbc", style_metrics="nowhere:metric")
     content = (checkpoint / "styles.json").read_text()

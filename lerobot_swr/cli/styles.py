@@ -21,6 +21,8 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_swr.cli.errors import explain_errors
+from lerobot_swr.cli.literal_flags import with_literal_text
+from lerobot_swr.dataset_checks import check_dimensions
 from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.policies.configuration_swr import ZBCConfig
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
@@ -28,7 +30,9 @@ from lerobot_swr.policies.style_extension import add_demonstrations
 from lerobot_swr.style_map import write_style_map
 from lerobot_swr.style_report import format_preview, format_table
 from lerobot_swr.style_table import StyleTable
-from lerobot_swr.trajectories import load_trajectories
+from lerobot_swr.trajectories import Trajectories
+
+TEXT_FLAGS = ("filter", "name", "forget", "behavior_rule", "style_metrics")
 
 
 @dataclass
@@ -163,7 +167,7 @@ def _write_map(
 ) -> None:
     assert cfg.map is not None
     try:
-        trajectories = load_reference(cfg.dataset, checkpoint)
+        trajectories = _reference(cfg, checkpoint)
     except (ValueError, OSError) as error:
         print(f"without the demonstrations' paths, which need the training dataset ({error})")
         trajectories = None
@@ -176,13 +180,17 @@ def _write_map(
 def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: ZBCPolicy) -> None:
     assert cfg.add is not None
     assert cfg.output_dir is not None
-    source = DatasetSource(root=cfg.add, episodes=cfg.episodes)
-    meta = source.metadata()
-    training = load_reference(cfg.dataset, checkpoint)
-    new = load_trajectories(meta, [key for key in training.columns if key in meta.features])
-    missing = [key for key in [*policy.config.observation_keys, "action"] if key not in new.columns]
+    meta = DatasetSource(root=cfg.add, episodes=cfg.episodes).metadata()
+    where, dimensions = f"add={str(cfg.add)!r}", policy.config.dimensions
+    missing = [key for key in dimensions if key not in meta.features]
     if missing:
-        raise ValueError(f"add={str(cfg.add)!r}: the dataset lacks {missing}, which the policy needs")
+        raise ValueError(f"{where}: the dataset lacks {', '.join(missing)}, which the policy needs")
+    shapes = {key: ft["shape"] for key, ft in meta.features.items()}
+    check_dimensions(
+        where, shapes, {key: [d] for key, d in dimensions.items()}, "add demonstrations of the same robot"
+    )
+    training = _reference(cfg, checkpoint, needs_actions=True)
+    new = policy.read_demonstrations(meta)
     added = add_demonstrations(policy, checkpoint.preprocessor, training, new, cfg.episodes, meta.robot_type)
     _save_new_checkpoint(cfg.checkpoint, policy, cfg.output_dir)
     print("style  nearest demonstration  action error (under the nearest demonstration's style)")
@@ -190,6 +198,17 @@ def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: ZBCPolicy) -> None:
         print("{:5d}  {:21d}  {:.4f} ({:.4f})".format(*row))
     numbers = ",".join(map(str, added.episodes))
     print(f"written to {cfg.output_dir}; draw only these with --policy.style_episodes=[{numbers}]")
+
+
+def _reference(cfg: StylesCommand, checkpoint: Checkpoint, needs_actions: bool = False) -> Trajectories:
+    """The training dataset."""
+    root = cfg.dataset.root
+    if root is not None and not root.is_dir():
+        raise FileNotFoundError(
+            f"dataset.root={str(root)!r}, the training dataset of {cfg.checkpoint}, does not exist; was it "
+            "moved? Give its folder: --dataset.root=FOLDER"
+        )
+    return load_reference(cfg.dataset, checkpoint, needs_actions)
 
 
 def _save_new_checkpoint(original: Path, policy: ZBCPolicy, folder: Path) -> None:
@@ -210,4 +229,5 @@ def main() -> None:
     register_third_party_plugins()
     if len(sys.argv) > 1 and not sys.argv[1].startswith("-"):
         sys.argv[1] = f"--checkpoint={sys.argv[1]}"
+    sys.argv = list(with_literal_text(sys.argv, TEXT_FLAGS))
     show_styles()

@@ -1,5 +1,6 @@
 """Enlarges a cookbook by demonstrations that were not trained on."""
 
+import logging
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,13 +10,16 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import nn
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.filters import names_in
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
 from lerobot_swr.similarity import pairwise_distances
 from lerobot_swr.style_encoding import STARTS, encode_styles
-from lerobot_swr.style_table import MAX_NEIGHBOURS, make_style_table
+from lerobot_swr.style_table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
 from lerobot_swr.trajectories import Trajectories
 
 CHUNK = 8  # episodes encoded at once; bounds memory
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,7 @@ def add_demonstrations(
             "name the new ones with --episodes=[...], or another dataset"
         )
     added = new.subset(chosen)
+    rows = None if same else _described(policy, added, robot_type)
 
     candidates = np.flatnonzero(trained)
     states = training.states(policy.compared_keys()) + added.states(policy.compared_keys())
@@ -91,7 +96,7 @@ def add_demonstrations(
     first = len(styles)
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))
     if not same:
-        _append_rows(policy, added, distances, len(training), robot_type)
+        _append_rows(policy, rows, distances, len(training))
     with torch.no_grad():
         styles.embedding.weight[numbers] = torch.cat(encoded)
     styles.trained[numbers] = 1
@@ -100,33 +105,57 @@ def add_demonstrations(
     )
 
 
-def _append_rows(
-    policy: ZBCPolicy, added: Trajectories, distances: np.ndarray, n_training: int, robot_type: str | None
-) -> None:
+def _described(policy: ZBCPolicy, added: Trajectories, robot_type: str | None) -> StyleTable | None:
+    """Rows of the table for new demonstrations; None where there is no table.
+
+    Outcomes that they lack are dropped from the policy's table, unless a named filter needs them.
+
+    Raises:
+        ValueError: If another column of the table cannot be computed.
+    """
+    config, table, where = policy.config, policy.styles.table, f"add={added.name!r}"
+    if table is None:
+        return None
+    if "task" in table.columns and not added.tasks:
+        added = replace(added, tasks=("",) * len(added))
+    rule = dataset_behavior_rule(config.behavior_rule, robot_type)
+    metrics = load_style_metrics(config.style_metrics)
+    rows = make_style_table(added, np.zeros((len(added), len(added))), rule, metrics)
+    missing = set(table.columns) - set(rows.columns)
+    if missing - OUTCOME_COLUMNS:
+        raise ValueError(
+            f"{where}: the columns {sorted(missing - OUTCOME_COLUMNS)} of the checkpoint's table cannot be "
+            "computed for it; name the rule or metric with --behavior_rule or --style_metrics "
+            "(module:function)"
+        )
+    needed = [name for name, text in table.filters.items() if missing & names_in(text)]
+    if needed:
+        raise ValueError(
+            f"{where}: the columns {sorted(missing)} of the checkpoint's table, which the named filters "
+            f"{needed} look at, cannot be computed for it: it has no usable {' and '.join(OUTCOMES)}; "
+            "--forget the filters first, or add the feature"
+        )
+    if missing:
+        logger.warning("%s: columns of the table that cannot be computed are dropped: %s", where, missing)
+        policy.styles.table = table.without_columns(missing)
+    return rows
+
+
+def _append_rows(policy: ZBCPolicy, rows: StyleTable | None, distances: np.ndarray, n_training: int) -> None:
     """Make room for new styles in the cookbook and describe them in the table."""
     config, styles = policy.config, policy.styles
-    first = len(styles)
-    if styles.table is not None:
-        rule = dataset_behavior_rule(config.behavior_rule, robot_type)
-        rows = make_style_table(
-            added, distances[:, n_training:], rule, load_style_metrics(config.style_metrics)
-        )
-        missing = sorted(set(styles.table.columns) - set(rows.columns))
-        if missing:
-            raise ValueError(
-                f"add={added.name!r}: the columns {missing} of the checkpoint's table cannot be computed for "
-                "it; name the rule or metric with --behavior_rule or --style_metrics (module:function)"
-            )
+    first, n_added = len(styles), len(distances)
+    if styles.table is not None and rows is not None:
         # Rows of the new demonstrations start at `first`, those of the training dataset at 0.
-        numbers = np.concatenate([np.arange(n_training), first + np.arange(len(added))])
+        numbers = np.concatenate([np.arange(n_training), first + np.arange(n_added)])
         neighbours = [
             [int(j) for j in numbers[np.argsort(row, kind="stable")] if j != first + i][:MAX_NEIGHBOURS]
             for i, row in enumerate(distances)
         ]
         styles.table = styles.table.extended(replace(rows, neighbours=neighbours))
-    enlarged = nn.Embedding(first + len(added), config.style_dim, device=styles.embedding.weight.device)
+    enlarged = nn.Embedding(first + n_added, config.style_dim, device=styles.embedding.weight.device)
     with torch.no_grad():
         enlarged.weight[:first] = styles.embedding.weight
     styles.embedding = enlarged
-    styles.trained = torch.cat([styles.trained, styles.trained.new_zeros(len(added))])
-    config.num_added_styles += len(added)
+    styles.trained = torch.cat([styles.trained, styles.trained.new_zeros(n_added)])
+    config.num_added_styles += n_added
