@@ -165,6 +165,12 @@ class ZBCPolicy(BCPolicy):
         """(B, A) normalised actions for normalised observations (B, d), one style per environment."""
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
+        if self._new_dataset and not self.styles.trained.any():
+            raise ValueError(
+                f"this policy was created to be trained on {self.dataset_root}, which is not the dataset of "
+                f"its checkpoint, so its {len(self.styles)} styles are new; to act with the checkpoint's, "
+                "load it without dataset_meta (ds_meta), whatever dataset you evaluate on"
+            )
         style = self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
         return self.predict(batch, style)
 

@@ -2,12 +2,15 @@
 
 import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
+
+from lerobot_swr.errors import USER_ERRORS, one_line
 
 
 def run_processes(
@@ -29,7 +32,8 @@ def run_processes(
         while waiting or running:
             while waiting and len(running) < jobs:
                 running.append(waiting.pop(0))
-                running[-1][1].start()
+                with _ignoring_interrupts():
+                    running[-1][1].start()
             time.sleep(0.2)
             if tick is not None:
                 tick()
@@ -64,10 +68,23 @@ def _wait_for_parent() -> None:
 
 
 @contextmanager
+def _ignoring_interrupts() -> Iterator[None]:
+    """Let processes that start within leave Ctrl-C, which the terminal sends to all, to this one."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
 def explained_exit() -> Iterator[None]:
     """In such a process: print the message of an input error and exit with status 2."""
     try:
         yield
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except USER_ERRORS as error:
+        print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(2)
