@@ -10,6 +10,7 @@ import pytest
 from lerobot.datasets import LeRobotDataset
 
 from lerobot_swr.cli.dataset import main
+from lerobot_swr.demos.d3il_avoiding import SCATTERED_BEHAVIORS
 from lerobot_swr.demos.d3il_converter import UNBALANCED_COUNTS, convert_recording, recorded_recipe, unbalanced
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.restricted_pickle import UnsafePickleError, load_recording
@@ -264,11 +265,20 @@ def test_a_selection_is_written_as_a_dataset(tmp_path):
     for i in range(5):
         dump(tmp_path / "in" / f"env_{i}.pkl", avoiding_recording(40 + i, x=0.4))
     recipe = recorded_recipe(tmp_path / "in", "unbalanced_avoiding")
-    places = [AVOIDING_BEHAVIORS[7 * k % 24] for k in range(24)]
-    expected = UNBALANCED_COUNTS[places.index("top-top-midtop")]
+    expected = UNBALANCED_COUNTS[SCATTERED_BEHAVIORS.index("top-top-midtop")]
     assert recipe.name == "d3il_human_unbalanced_avoiding"
     assert recipe.n_episodes == expected < 5
     assert write_dataset(recipe, tmp_path / "out") == {"top-top-midtop": expected}
+
+
+def test_recordings_that_all_failed_make_no_selection(tmp_path):
+    """The message names the folder and what they show, instead of an empty dataset."""
+    dump(
+        tmp_path / "in" / "env_0.pkl",
+        {"robot": {k: v[:20] for k, v in avoiding_recording()["robot"].items()}},
+    )
+    with pytest.raises(ValueError, match=r"none of these 1 recordings passes the obstacles; they show unfin"):
+        recorded_recipe(tmp_path / "in", "unbalanced_avoiding")
 
 
 def test_one_bad_recording_leaves_no_dataset(tmp_path):
@@ -282,7 +292,7 @@ def test_one_bad_recording_leaves_no_dataset(tmp_path):
 
 def test_wrong_folders_and_lists(tmp_path):
     """Wrong tasks, folders and lists are explained."""
-    with pytest.raises(ValueError, match=r"task='stacking'.*avoiding, unbalanced_avoiding, aligning"):
+    with pytest.raises(ValueError, match=r"task='stacking'.*avoiding, aligning, unbalanced_avoiding"):
         recorded_recipe(tmp_path, "stacking")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         recorded_recipe(tmp_path / "nowhere", "avoiding")

@@ -28,17 +28,36 @@ def recorded(*episodes: dict[str, np.ndarray]) -> Trajectories:
     [
         ("...>>>", "xxx---"),
         (">>>...", "------"),  # what an episode ends with was meant
-        ("..>>...>>..", "xx---xx----"),
+        ("..>>...>>..", "xx--xxx----"),
+        (">.>", "---"),
         (">>>>", "----"),
         ("....", "----"),
     ],
 )
 def test_a_pause_is_followed_by_a_movement(steps, expected):
-    """At the start or on the way, where its first frame, in which the action stops, is kept."""
-    found = pause_frames(recorded(walk(steps), walk(">>")), ["observation.state"], "action")
+    """At the start or on the way; a single frame of another action is no pause."""
+    found = pause_frames(recorded(walk(steps), walk(10 * ">")), ["observation.state"], "action")
     shown = "".join("x" if pause else "-" for pause in found[: len(steps)])
     assert shown == expected
     assert not found[len(steps) :].any()
+
+
+def test_a_slow_movement_is_no_pause():
+    """Its steps are as small as a pause's; what it comes to is not."""
+    steps = np.concatenate([np.full(20, 0.5), np.full(25, 0.02), np.full(15, 0.5)])
+    for action in (steps, np.cumsum(steps)):
+        state = np.cumsum(steps) - steps
+        episode = {"observation.state": state[:, None], "action": action[:, None]}
+        assert not pause_frames(recorded(episode), ["observation.state"], "action").any()
+
+
+def test_a_dimension_that_only_jitters_hides_no_pause():
+    """A sensor's noise is not a movement, however small everything else that it is measured by."""
+    episode = walk(">>>....>>>>>>")
+    noise = np.random.default_rng(0).normal(scale=1e-6, size=(13, 1))
+    episode["observation.state"] = np.concatenate([episode["observation.state"], 1 + noise], axis=1)
+    found = pause_frames(recorded(episode), ["observation.state"], "action")
+    assert np.flatnonzero(found).tolist() == [3, 4, 5, 6]
 
 
 def test_targets_are_held_in_a_pause():
@@ -61,12 +80,12 @@ def test_whoever_waits_for_something_that_moves_does_not_pause():
 
 def test_frames_are_left_out_of_every_episode():
     """`Trajectories.without` keeps order and episodes."""
-    dataset = recorded(walk("..>>"), walk(".>"))
+    dataset = recorded(walk("..>>"), walk(".>"), walk(10 * ">"))
     kept = dataset.without(pause_frames(dataset, ["observation.state"], "action"))
-    assert kept.lengths.tolist() == [2, 1]
-    assert kept.columns["action"].ravel().tolist() == [MOVE, MOVE, MOVE]
+    assert kept.lengths.tolist() == [2, 1, 10]
+    assert (kept.columns["action"] == np.float32(MOVE)).all()
     with pytest.raises(ValueError, match="nothing is left of episode 1"):
-        dataset.without(np.array([False, False, False, False, True, True]))
+        dataset.without(np.repeat([False, True, False], dataset.lengths))
 
 
 @pytest.mark.parametrize("balance", [True, False])

@@ -209,20 +209,32 @@ def test_several_folders_are_published_as_one(finished, tmp_path, run_command):
     more, target = tmp_path / "more", tmp_path / "published"
     shutil.copytree(finished, more)
     files = {
-        (one.policy, one.kind): f"{one.kind}-small_maze-{one.policy}-deterministic-{one.key}.json"
+        (one.policy, one.kind): f"{one.kind}-small_maze-{one.policy}-{one.labels.condition}-{one.key}.json"
         for one in load_suites(finished)["table1"].cells
     }
     lost, kept = (finished / "results" / files[policy, "evaluate"] for policy in ("zbc", "wzbc"))
     lost.unlink()
+    other = {"key": "x" * 12, "needs": "y" * 12}  # in the other folder, its training has another key, too
     (more / "results" / kept.name).write_text(kept.read_text().replace('"success":[1', '"success":[0'))
-    manifest = more / "suites" / "table1.json"  # where zbc's evaluation has another key
-    manifest.write_text(manifest.read_text().replace(lost.stem, f"{lost.stem[:-1]}x"))
-    (more / "results" / lost.name).rename(more / "results" / f"{lost.stem[:-1]}x.json")
+    evaluated, trained = (more / "results" / files["zbc", kind] for kind in ("evaluate", "train"))
+    manifest = more / "suites" / "table1.json"
+    for file, key in ((evaluated, other["key"]), (trained, other["needs"])):
+        content = {**json.loads(file.read_text()), "key": key}
+        content["needs"] = None if file == trained else other["needs"]
+        renamed = file.with_name(f"{file.stem[:-12]}{key}.json")
+        renamed.write_text(json.dumps(content))
+        file.unlink()
+        manifest.write_text(manifest.read_text().replace(file.name, renamed.name))
     run_command(report_command, finished, more, f"--publish={target}", "--suites=[table1]")
     suite = load_suites(target)["table1"]
     assert not suite.missing
     assert (target / "results" / kept.name).read_text() == kept.read_text()
     assert {c.policy for c in suite.evaluations("small_maze")} >= {"bc", "zbc", "wzbc"}
+    assert all(c.training is not None for c in suite.evaluations("small_maze"))
+    description = next((more / "results").glob("dataset-*.json"))
+    description.write_text(description.read_text().replace('"length":[', '"length":[1,'))
+    with pytest.raises(ValueError, match="results on different datasets called 'small_maze'"):
+        publish([finished, more], target)
 
 
 def test_results_are_not_published_over_themselves(finished):

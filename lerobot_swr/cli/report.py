@@ -38,6 +38,8 @@ class ReportCommand:
 @parser.wrap()
 def report(cfg: ReportCommand) -> None:
     """Write the report."""
+    if not cfg.results:
+        raise ValueError("results=[]: name the folder that lerobot-swr-reproduce wrote to")
     root = cfg.results[0]
     if cfg.publish is not None:
         publish(cfg.results, cfg.publish, cfg.suites)
@@ -57,6 +59,9 @@ def report(cfg: ReportCommand) -> None:
 def main() -> None:
     """Entry point."""
     folders = list(itertools.takewhile(lambda word: not word.startswith("-"), sys.argv[1:]))
+    named = [word.removeprefix("--results=") for word in sys.argv[1:] if word.startswith("--results=")]
     if folders:
         sys.argv[1 : 1 + len(folders)] = [f"--results={json.dumps(folders)}"]
+    elif named and not named[0].startswith("["):  # a single folder
+        sys.argv[sys.argv.index(f"--results={named[0]}")] = f"--results={json.dumps(named)}"
     report()

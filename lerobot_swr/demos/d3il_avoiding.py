@@ -162,9 +162,10 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
 
 BALANCED = dict.fromkeys(AVOIDING_BEHAVIORS, 4)
 
-# Skewed like everyday habits: three ways make a third of the demonstrations, five are shown only once. The
-# k-th count belongs to behaviour 7 k mod 24, so that frequent ways are not neighbours.
+SCATTERED_BEHAVIORS = tuple(AVOIDING_BEHAVIORS[7 * k % 24] for k in range(24))
+"""All of them in an order in which neighbours lie far apart: in a skewed dataset, the most frequent first."""
+# Skewed like everyday habits: three ways make a third of the demonstrations, five are shown only once.
 _SKEWED_COUNTS = (14, 11, 9, 8, 7, 6, 5, 4, 4, 3, 3, 3, 2, 2, 2, 2, 2, 2, 2, 1, 1, 1, 1, 1)
-UNBALANCED = {AVOIDING_BEHAVIORS[7 * k % 24]: count for k, count in enumerate(_SKEWED_COUNTS)}
+UNBALANCED = dict(zip(SCATTERED_BEHAVIORS, _SKEWED_COUNTS, strict=True))
 
 AVOIDING_RECIPES = (_recipe("d3il_avoiding", BALANCED), _recipe("d3il_unbalanced_avoiding", UNBALANCED))

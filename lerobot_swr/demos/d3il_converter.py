@@ -12,7 +12,7 @@ keeps the recorded pairs is one step staler than any that a policy meets in the 
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,22 +20,20 @@ from typing import Any
 import numpy as np
 
 from lerobot_swr.demos.d3il_aligning import ALIGNING_RECIPES
-from lerobot_swr.demos.d3il_avoiding import AVOIDING_RECIPES
+from lerobot_swr.demos.d3il_avoiding import AVOIDING_RECIPES, SCATTERED_BEHAVIORS
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.demos.restricted_pickle import load_recording
-from lerobot_swr.envs.d3il.behavior import AVOIDING_BEHAVIORS, avoiding_behavior
+from lerobot_swr.envs.d3il.behavior import avoiding_behavior
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, AVOIDING_SCENE
 
-TASKS = {
-    "avoiding": AVOIDING_RECIPES[0],
-    "unbalanced_avoiding": AVOIDING_RECIPES[0],
-    "aligning": ALIGNING_RECIPES[0],
-}
-"""What ``--from_d3il`` can make, and the recipe of the scripted dataset with the same features."""
+TASKS = {"avoiding": AVOIDING_RECIPES[0], "aligning": ALIGNING_RECIPES[0]}
+"""Tasks with recordings, and the recipe of the scripted dataset with the same features."""
+UNBALANCED = "unbalanced_avoiding"
+"""A selection of the recordings of avoiding, by `unbalanced`."""
 
 UNBALANCED_COUNTS = (4,) * 6 + (3,) * 6 + (2,) * 6 + (1,) * 6
 """Recordings kept of each of the 24 behaviours, of which the benchmark has four each; the k-th count belongs
-to behaviour 7 k mod 24, as in the scripted dataset, so that frequent ways are not neighbours."""
+to the k-th of `SCATTERED_BEHAVIORS`."""
 
 
 def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> DatasetRecipe:
@@ -52,30 +50,36 @@ def recorded_recipe(folder: Path, task: str, file_list: Path | None = None) -> D
         ValueError: If the task is unknown, there is no recording, or the file list cannot be read.
         FileNotFoundError: If the folder, the list or a listed file does not exist.
     """
-    if task not in TASKS:
-        raise ValueError(f"task={task!r}: recordings can be converted for {', '.join(TASKS)}")
+    if task not in (*TASKS, UNBALANCED):
+        known = ", ".join((*TASKS, UNBALANCED))
+        raise ValueError(f"task={task!r}: recordings can be converted for {known}")
     if not folder.is_dir():
         raise FileNotFoundError(f"from_d3il={str(folder)!r}: no such folder")
     files = _all_recordings(folder) if file_list is None else _listed_recordings(folder, file_list)
     if not files:
         raise ValueError(f"from_d3il={str(folder)!r}: no recordings (*.pkl) in it")
 
-    if task == "unbalanced_avoiding":
-        recorded = [convert_recording(path, "avoiding") for path in files]
-        labels = [avoiding_behavior(one.observations) for one in recorded]
-        n_episodes = len(unbalanced(labels, seed=0))
-    else:
-        n_episodes = len(files)
+    if task == UNBALANCED:
+        labels = [avoiding_behavior(convert_recording(path, "avoiding").observations) for path in files]
+        if not unbalanced(labels, seed=0):
+            raise ValueError(
+                f"from_d3il={str(folder)!r}: none of these {len(files)} recordings passes the obstacles; "
+                f"they show {', '.join(sorted(set(labels)))}"
+            )
+        return _recipe_of(task, "avoiding", lambda seed: [files[i] for i in unbalanced(labels, seed)])
+    return _recipe_of(task, task, lambda seed: files)
+
+
+def _recipe_of(name: str, task: str, chosen: Callable[[int], list[Path]]) -> DatasetRecipe:
+    """A recipe of the recordings of a task that a seed chooses."""
 
     def demonstrations(seed: int) -> Iterator[Demonstration]:
-        if task == "unbalanced_avoiding":
-            return (recorded[i] for i in unbalanced(labels, seed))
-        return (convert_recording(path, task) for path in files)
+        return (convert_recording(path, task) for path in chosen(seed))
 
     return replace(
         TASKS[task],
-        name=human_name(task),
-        n_episodes=n_episodes,
+        name=human_name(name),
+        n_episodes=len(chosen(0)),
         demonstrations=demonstrations,
         resumable_demonstrations=None,
     )
@@ -97,8 +101,7 @@ def unbalanced(labels: Sequence[str], seed: int) -> list[int]:
     rng = np.random.default_rng(seed)
     kept: list[int] = []
     for k, count in enumerate(UNBALANCED_COUNTS):
-        behavior = AVOIDING_BEHAVIORS[7 * k % len(AVOIDING_BEHAVIORS)]
-        of_it = [i for i, label in enumerate(labels) if label == behavior]
+        of_it = [i for i, label in enumerate(labels) if label == SCATTERED_BEHAVIORS[k]]
         kept += rng.permutation(of_it)[:count].tolist()
     return sorted(map(int, kept))
 

@@ -56,7 +56,9 @@ def plot_behaviors(
     for axes, paths, name in ((left, demonstrations, "demonstrations"), (middle, rollouts, "rollouts")):
         draw_paths(axes, paths, colors, env_cfg)
         axes.set_title(f"{len(paths)} {name}")
-    draw_histograms(bars.subplots(), reference, shown)
+    histograms = bars.subplots()
+    draw_histograms(histograms, reference, shown)
+    histograms.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     figure.suptitle(title)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -120,7 +122,7 @@ def draw_histograms(axes: Axes, reference: Histogram, shown: Histogram) -> None:
     axes.bar(place + 0.2, [row[2] for row in rows], 0.4, label="rollouts", color=ROLLOUTS)
     axes.set_xticks(place, [row[0] for row in rows], rotation=90 if len(rows) > 6 else 0)
     axes.set(xlabel="behaviour", ylabel="share of episodes")
-    axes.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
+    axes.legend()
 
 
 def plot_offline(

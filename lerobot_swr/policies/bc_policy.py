@@ -34,10 +34,10 @@ class BCPolicy(DatasetPolicy):
         super().__init__(config, dataset_meta)
         self.network = self._make_network()
         self._episode_weights = self._balance_weights()
-        self._is_pause: Tensor | None = None
+        self._pause_weights: Tensor | None = None  # (F,) 0 in a pause, their mean over all frames is 1
         if self.pauses is not None:
-            self._is_pause = torch.from_numpy(self.pauses)
-            self._rows = FrameRows(self.trajectories)
+            moves = torch.from_numpy(~self.pauses).to(torch.float32)
+            self._pause_weights, self._rows = moves / moves.mean(), FrameRows(self.trajectories)
 
     @property
     def _style_dim(self) -> int:
@@ -56,18 +56,11 @@ class BCPolicy(DatasetPolicy):
         )
 
     def _balance_weights(self) -> Tensor | None:
-        """(N,) factors of the loss of each episode's frames, pauses left out; None for 1.
-
-        Mean length / length of each episode: uniform frames become uniform episodes. Where pauses count 0,
-        the mean over all frames is 1.
-        """
-        if self._trajectories is None or not (self.config.balance_episodes or self.pauses is not None):
+        """(N,) mean length / length of each episode: uniform frames become uniform episodes."""
+        if not self.config.balance_episodes or self._trajectories is None:
             return None
-        lengths = torch.from_numpy(self._trajectories.lengths).to(torch.float32)
-        kept = torch.from_numpy(self.moving_trajectories.lengths).to(torch.float32)
-        if not self.config.balance_episodes:
-            return (lengths.sum() / kept.sum()).expand(len(lengths))
-        return lengths.mean() / kept
+        lengths = torch.from_numpy(self.moving_trajectories.lengths).to(torch.float32)
+        return lengths.mean() / lengths
 
     # --- LeRobot's training interface ---
 
@@ -107,14 +100,14 @@ class BCPolicy(DatasetPolicy):
     def frame_weights(self, batch: dict[str, Tensor]) -> Tensor:
         """(B,) factors that let uniformly drawn frames count every episode alike, and pauses not at all."""
         episodes = batch["episode_index"]
-        if self._episode_weights is None:
-            return torch.ones(len(episodes), device=episodes.device)
-        self._episode_weights = self._episode_weights.to(episodes.device)
-        weights = self._episode_weights[episodes]
-        if self._is_pause is None:
-            return weights
-        self._is_pause = self._is_pause.to(episodes.device)
-        return weights * ~self._is_pause[self._rows(batch)]
+        weights = torch.ones(len(episodes), device=episodes.device)
+        if self._episode_weights is not None:
+            self._episode_weights = self._episode_weights.to(episodes.device)
+            weights = self._episode_weights[episodes]
+        if self._pause_weights is not None:
+            self._pause_weights = self._pause_weights.to(episodes.device)
+            weights = weights * self._pause_weights[self._rows(batch)]
+        return weights
 
     def frame_losses(self, drawn: dict[str, Tensor]) -> Tensor:
         """(B,) weighted loss of each frame; a pure function of the parameters and of what `draw` returned."""

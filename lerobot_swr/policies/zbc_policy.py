@@ -61,12 +61,7 @@ class ZBCPolicy(BCPolicy):
             self.corrections = Corrections(config)
         if self.corrections is not None and self._dynamics is not None:
             stats = cast(LeRobotDatasetMetadata, dataset_meta).stats
-            weights = self._episode_weights
-            if weights is not None and self.pauses is not None:
-                weights = weights * float(
-                    (~self.pauses).mean()
-                )  # corrective frames come from the others alone
-            self.corrections.adopt_dataset(config, self._dynamics, stats, weights)
+            self.corrections.adopt_dataset(config, self._dynamics, stats, self._episode_weights)
         if dataset_meta is not None:
             self.styles.table = self.make_table(self.trajectories, dataset_meta)
 

@@ -7,21 +7,16 @@ from lerobot_swr.evaluation.report import Table
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
 from lerobot_swr.reproduction.suites import UNPERTURBED
 from lerobot_swr.reproduction.summary import Summary
-from lerobot_swr.reproduction.tables import INTERVALS, NOTHING, floor, l1, rollouts, share, steps
-
-PERTURBATIONS = {
-    "maze2d": (
-        "pseudo-random start, start radius: uniform in a square of that half-width (pseudo-random: 0.10) "
-        "around the start, as a share of the side; random start: anywhere; noise: on every step, standard "
-        "deviation in largest steps of 0.02 of the side (transition noise: 1); sticky walls: an agent that "
-        "hits a wall stays where it was."
-    ),
-    "d3il": (
-        "start: the tool starts anywhere in a square of that half-width; action noise: standard deviation on "
-        "each coordinate of every action; box pushed: once per episode, by that much where it stands free. "
-        "Without perturbation the start of the tool is that of the task."
-    ),
-}
+from lerobot_swr.reproduction.tables import (
+    INTERVALS,
+    NOTHING,
+    PERTURBATIONS,
+    floor,
+    l1,
+    rollouts,
+    share,
+    steps,
+)
 
 
 def length_error(summary: Summary) -> str:

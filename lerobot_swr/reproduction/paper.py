@@ -1,9 +1,10 @@
 """Numbers of the paper that stand beside ours.
 
 Its mazes, demonstrations and magnitudes of perturbation are others than ours, so the figures tell the order
-of magnitude and nothing more; only the human recordings of avoiding are the same. Means and standard
-deviations over its 5 training seeds, from the source of arXiv 2504.18160 (the authors' project page differs
-from it in five places). DDPM-GPT and DDPM-ACT are its names of ``ddpm_gpt`` and ``ddpm_act``.
+of magnitude and nothing more; only the 96 human recordings of avoiding are the same (the unbalanced selection
+of them is ours). Means and standard deviations over its 5 training seeds, from the source of arXiv 2504.18160
+(the authors' project page differs from it in five places). DDPM-GPT and DDPM-ACT are its names of
+``ddpm_gpt`` and ``ddpm_act``.
 """
 
 from typing import NamedTuple

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Container, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,9 @@ def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = 
             if only is None or name in only:
                 manifest = json.loads((source / "suites" / f"{name}.json").read_text())
                 origin = {**{file: source / "results" / file for file in suite.files}, **origin}
-                manifests[name] = _merged(manifests.get(name), manifest, origin)
+                manifests[name] = (
+                    _merged(manifests[name], manifest, origin) if name in manifests else manifest
+                )
     if not manifests:
         raise ValueError(f"suites={list(only or [])}: none of them is in {', '.join(map(str, sources))}")
     for folder in ("results", "suites"):
@@ -54,10 +56,27 @@ def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = 
                 shutil.copy(origin[file], target / "results")
 
 
-def _merged(first: dict[str, Any] | None, second: dict[str, Any], finished: Container[str]) -> dict[str, Any]:
-    """A suite's manifest from two folders' ones."""
-    if first is None:
-        return second
+def _merged(first: dict[str, Any], second: dict[str, Any], finished: Mapping[str, Path]) -> dict[str, Any]:
+    """A suite's manifest from two folders' ones.
+
+    Args:
+        first: A manifest, whose finished cells are kept.
+        second: Another one.
+        finished: Where the files of both are that there are.
+
+    Raises:
+        ValueError: If both have different datasets of one name.
+    """
+
+    def stored(file: str) -> dict[str, Any]:
+        return json.loads(finished[file].read_text())
+
+    for name in first["datasets"].keys() & second["datasets"].keys():
+        one, other = (stored(manifest["datasets"][name])["result"] for manifest in (first, second))
+        if any(one[key] != other[key] for key in ("behavior", "length", "steps_to_end")):
+            raise ValueError(
+                f"the folders hold results on different datasets called {name!r}; publish them apart"
+            )
 
     def what(file: str) -> str:
         """Kind, dataset, policy and condition, without the cell's key."""
@@ -65,12 +84,15 @@ def _merged(first: dict[str, Any] | None, second: dict[str, Any], finished: Cont
 
     there = {what(file) for file in first["cells"] if file in finished}
     instead = [file for file in second["cells"] if what(file) not in there]
+    # An evaluation comes with the training that it needs.
+    needed = {stored(file)["needs"] for file in instead if file in finished}
+    instead += [f for f in second["cells"] if f.removesuffix(".json").rpartition("-")[2] in needed]
     kept = [f for f in first["cells"] if f in finished or what(f) not in map(what, instead)]
     return {
         **first,
         "command": "\n".join(dict.fromkeys([*first["command"].split("\n"), second["command"]])),
-        "datasets": {**second["datasets"], **first["datasets"]},
-        "cells": [*kept, *(file for file in instead if file not in kept)],
+        "datasets": {**first["datasets"], **second["datasets"], **first["datasets"]},
+        "cells": list(dict.fromkeys([*kept, *instead])),
     }
 
 

@@ -21,11 +21,12 @@ from lerobot_swr.reproduction.suites import UNPERTURBED
 
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
-    "demonstrators and the sizes of the perturbations are this package's own, so the paper's numbers beside "
-    "ours tell the order of magnitude and nothing more; a dash stands where we have none to quote. L1 is the "
-    "distance of the behaviour histograms of rollouts and demonstrations, 0 (equal) to 2 (disjoint); failed "
-    "rollouts are behaviours of their own. Drawing styles uniformly (the paper's protocol), even a perfect "
-    "reproducer scores the floor; with each style used once (stratified) its L1 is 0."
+    "scripted demonstrators and the sizes of the perturbations are this package's own, so the paper's "
+    "numbers beside ours tell the order of magnitude and nothing more, except on the benchmark's human "
+    "recordings; a dash stands where we have none to quote. L1 is the distance of the behaviour histograms "
+    "of rollouts and demonstrations, 0 (equal) to 2 (disjoint); failed rollouts are behaviours of their own. "
+    "Drawing styles uniformly (the paper's protocol), even a perfect reproducer scores the floor; with each "
+    "style used once (stratified) its L1 is 0."
 )
 
 

@@ -23,22 +23,25 @@ INTERVALS = (
 
 
 SCENES = (
-    f"{ONE_SCENE}: all rollouts of a training seed start with box and target in one place, that of its "
-    "first rollout; otherwise every rollout has places of its own. The paper does not say which it does; its "
-    "BC, which succeeds in all rollouts of one seed and in almost none of the others, fits one scene."
+    f"{ONE_SCENE}: all rollouts of a training seed start with box and target in one place, another one for "
+    "each seed; otherwise every rollout has places of its own. A policy without styles or noise then repeats "
+    "one rollout, and its interval of success says nothing. The paper does not say which it does; its BC, "
+    "which succeeds in all rollouts of one seed and in almost none of the others, fits one scene."
 )
-IN_MAZES = (
-    "pseudo-random start: uniform in ± 0.10 of the side around the start; random start: anywhere; transition "
-    "noise: on every step, with a standard deviation of the largest step (0.02 of the side). Style match: "
-    "rollouts with the behaviour of the demonstration whose style they use, of its doors those ahead of the "
-    "start; L1 counts all doors, so it cannot be small from random starts. The paper's figures are of its "
-    "own maze and perturbations."
-)
-ON_THE_ARM = (
-    "start: the tool starts anywhere in a square of that half-width; action noise: standard deviation on "
-    "each coordinate of every action. Style match: rollouts with the behaviour of the demonstration whose "
-    "style they use. The paper perturbs mazes only."
-)
+PERTURBATIONS = {
+    "maze2d": (
+        "pseudo-random start, start radius: uniform in a square of that half-width (pseudo-random: 0.10) "
+        "around the start, as a share of the side; random start: anywhere; noise: on every step, standard "
+        "deviation in largest steps of 0.02 of the side (transition noise: 1); sticky walls: an agent that "
+        "hits a wall stays where it was."
+    ),
+    "d3il": (
+        "start: the tool starts anywhere in a square of that half-width; action noise: standard deviation on "
+        "each coordinate of every action; box pushed: once per episode, by that much where it stands free. "
+        "Without perturbation the start of the tool is that of the task."
+    ),
+}
+"""By type of the environment."""
 
 
 def quoted(figures: paper.Quoted | None) -> str:
@@ -142,31 +145,36 @@ def named(cell: StoredCell) -> str:
 
 def whole_table1(suite: SuiteResults) -> list[Table]:
     """The paper's Table 1 as it stands there, ours and the paper's figures one above the other."""
-    measures: dict[str, tuple[Callable[[Summary], list[float]], int]] = {
-        "L1 of the behaviour histograms": (lambda summary: summary.l1_by_seed, 0),
-        "Success": (lambda summary: summary.success.by_seed, 1),
-    }
-    return [_whole(suite, what, by_seed, place) for what, (by_seed, place) in measures.items()]
+    return [
+        _whole(suite, "L1 of the behaviour histograms", lambda s: s.l1_by_seed, lambda quoted: quoted.l1),
+        _whole(suite, "Success", lambda s: s.success.by_seed, lambda quoted: quoted.success),
+    ]
 
 
-def _whole(suite: SuiteResults, what: str, by_seed: Callable[[Summary], list[float]], place: int) -> Table:
+def _whole(
+    suite: SuiteResults,
+    what: str,
+    by_seed: Callable[[Summary], list[float]],
+    theirs: Callable[[paper.Quoted], paper.Deviating],
+) -> Table:
     rows = []
     for dataset in suite.datasets:
-        cells = {(c.labels.condition, c.policy): c for c in suite.evaluations(dataset)}
+        # Policies with their usual options alone.
+        cells = {(c.labels.condition, c.labels.policy): c for c in suite.evaluations(dataset)}
         for condition in dict.fromkeys(condition for condition, _ in cells):
             row = [dataset if condition == UNPERTURBED else f"{dataset},\n{condition}"]
             for policy in paper.POLICIES:
-                cell, theirs = cells.get((condition, policy)), paper.table1(dataset, policy)
+                cell, quoted = cells.get((condition, policy)), paper.table1(dataset, policy)
                 ours = NOTHING
                 if cell is not None:
                     values = by_seed(cell.summaries["uniform"])
                     ours = deviating((float(np.mean(values)), float(np.std(values))))
-                row.append(f"{ours}\n{NOTHING if theirs is None else deviating(theirs[place])}")
+                row.append(f"{ours}\n{NOTHING if quoted is None else deviating(theirs(quoted))}")
             rows.append(tuple(row))
     caption = (
         f"{what}, styles drawn uniformly: ours, and below it the paper's; mean ± standard deviation over "
-        "training seeds (of those that were trained, as the paper's are). Only the human recordings of "
-        "avoiding are data that both have."
+        "training seeds (of those that were trained, as the paper's are). Only the 96 human "
+        "recordings of avoiding are data that both have; the unbalanced selection of them is ours."
     )
     if any(cell.labels.condition == ONE_SCENE for cell in suite.cells):
         caption += f" {SCENES}"
@@ -207,7 +215,17 @@ def robustness(suite: SuiteResults, dataset: str) -> Table:
         "floor",
         "paper's L1,\nsuccess",
     )
-    caption = f"{dataset}. {IN_MAZES if in_maze else ON_THE_ARM} {INTERVALS}"
+    explained = PERTURBATIONS.get(suite.datasets[dataset].env["type"], "")
+    caption = (
+        f"{dataset}. {explained} {INTERVALS} Style match: rollouts with the behaviour of the demonstration "
+        "whose style they use. "
+    )
+    if in_maze:
+        caption += (
+            "Of its doors those ahead of the start count; L1 counts all doors, so it cannot be small from "
+            "random starts. "
+        )
+    caption += "The paper's figures, if any, are of its own maze and perturbations."
     return Table(caption, header, rows)
 
 
