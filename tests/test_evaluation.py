@@ -12,7 +12,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.evaluation.metrics import histogram, l1_distance
-from lerobot_swr.evaluation.rollouts import StateRecorder, make_rollout_env
+from lerobot_swr.evaluation.rollouts import StateRecorder
 from lerobot_swr.trajectories import load_trajectories
 
 ENV = ("--env.type=maze2d", "--env.task=small", "--env.episode_length=60")
@@ -186,7 +186,7 @@ def test_the_recorder_ends_with_the_terminal_state_under_autoreset():
         [lambda: gym.make(cfg.gym_id, **cfg.gym_kwargs)] * 2, autoreset_mode=AutoresetMode.SAME_STEP
     )
     recorded = []
-    for env in (StateRecorder(reset_at_once), StateRecorder(make_rollout_env(cfg, 2))):
+    for env in (StateRecorder(reset_at_once), StateRecorder(cfg.create_rollout_env(2))):
         env.reset(seed=[0, 1])
         for _ in range(4):
             env.step(np.array([[0.5, 1.0], [1.0, 0.0]], dtype=np.float32))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from lerobot_swr.cli.report import main as report_command
-from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.reproduction import contracting_tables
 from lerobot_swr.reproduction.cells import Cell, Store, write_text
 from lerobot_swr.reproduction.demonstrations import (
@@ -79,12 +79,12 @@ def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> No
     demos = prepare(small_maze.name, small_maze.parent, store)
     settings = ReproductionSettings(seeds=2, n_rollouts=12, sweep_seeds=1, output_dir=store.root)
     trajectories: Trajectories = load_low_dimensional(small_maze)
-    env_cfg = environment(demos.env)
-    behaviors = [env_cfg.behavior_rule()(episode) for episode in trajectories.episodes()]
+    task = task_of(environment(demos.env))
+    behaviors = [task.behavior_rule()(episode) for episode in trajectories.episodes()]
     lengths = trajectories.lengths.tolist()
     for module in ("suites", "tables", "figures"):
         monkeypatch.setattr(f"lerobot_swr.reproduction.{module}.LENGTH_BAND", (min(lengths), max(lengths)))
-    paths = [short_path(path_of(env_cfg, episode)) for episode in trajectories.episodes()]
+    paths = [short_path(task.plot_path(episode)) for episode in trajectories.episodes()]
     for suite in SUITES:
         cells = suite_cells(suite, settings, [demos])
         for one in cells:

@@ -25,8 +25,8 @@ from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.eval_options import EvalCommand
 from lerobot_swr.cli.literal_flags import with_literal_text
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, path_of, write_json
+from lerobot_swr.envs.task import task_of
+from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
@@ -153,7 +153,8 @@ def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories,
             checkpoint, cfg.env, rule, demonstrated, cfg.blend, cfg.batch_size, cfg.seed
         )
         write_json(cfg.output_dir / "blend.json", blends, _provenance(cfg))
-        paths = [path_of(cfg.env, rollout.observations) for rollout in rollouts]
+        task = task_of(cfg.env)
+        paths = [task.plot_path(rollout.observations) for rollout in rollouts]
         plot_blends(cfg.output_dir / "blend.png", blends, paths, cfg.env, f"{title}: blends of two styles")
         print(f"{title}\n{format_blends(blends)}")
     print(f"written to {cfg.output_dir}")
@@ -162,12 +163,8 @@ def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories,
 def _rule(cfg: EvalCommand) -> BehaviorRule:
     if cfg.behavior_rule is not None:
         return load_behavior_rule(cfg.behavior_rule)
-    if isinstance(cfg.env, TaskEnvConfig):
-        return cfg.env.behavior_rule()
-    raise ValueError(
-        f"env.type={cfg.env.type!r} has no behaviour rule of its own: name one with "  # type: ignore[union-attr]
-        "--behavior_rule=module:function"
-    )
+    assert cfg.env is not None
+    return task_of(cfg.env).behavior_rule()
 
 
 def _provenance(cfg: EvalCommand) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from lerobot.envs import EnvConfig
 
 from lerobot_swr.behaviors import BehaviorRule
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import (
     Histogram,
@@ -109,10 +109,10 @@ def evaluate_behaviors(
     )
     styled = [r for r in rollouts if r.style_episode is not None and r.style_episode < len(demonstrated)]
     requested = [demonstrated[r.style_episode] for r in styled if r.style_episode is not None]
-    if isinstance(env_cfg, TaskEnvConfig):
+    if env_cfg is not None:
+        task = task_of(env_cfg)
         requested = [
-            env_cfg.expected_behavior(label, r.observations)
-            for label, r in zip(requested, styled, strict=True)
+            task.expected_behavior(label, r.observations) for label, r in zip(requested, styled, strict=True)
         ]
     matches = [r.behavior == wanted for r, wanted in zip(styled, requested, strict=True)]
     length_errors = [
@@ -187,6 +187,7 @@ def compare(
         seed: Seeds the drawing of styles and the environments.
         reference_episodes: The demonstrations to compare with; None takes all.
     """
+    task = task_of(env_cfg)
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed)
     sampling, drawn = None, None
@@ -204,8 +205,8 @@ def compare(
             steps_to_end(env_cfg, trajectories),
             env_cfg,
         ),
-        [(path_of(env_cfg, trajectories.episode(i)), demonstrated[i]) for i in chosen],
-        [(path_of(env_cfg, rollout.observations), rollout.behavior) for rollout in rollouts],
+        [(task.plot_path(trajectories.episode(i)), demonstrated[i]) for i in chosen],
+        [(task.plot_path(rollout.observations), rollout.behavior) for rollout in rollouts],
     )
 
 
@@ -217,16 +218,8 @@ def allowed_episodes(checkpoint: Checkpoint, n_demonstrations: int) -> list[int]
 
 def steps_to_end(env_cfg: EnvConfig, trajectories: Trajectories) -> list[int]:
     """Steps of every demonstration until the environment would have ended it."""
-    if isinstance(env_cfg, TaskEnvConfig):
-        return [env_cfg.steps_to_end(episode) for episode in trajectories.episodes()]
-    return trajectories.lengths.tolist()
-
-
-def path_of(env_cfg: EnvConfig, observations: Mapping[str, np.ndarray]) -> np.ndarray:
-    """(T, 2) path of an episode, as pictures draw it."""
-    if isinstance(env_cfg, TaskEnvConfig):
-        return env_cfg.plot_path(observations)
-    return observations["observation.state"][:, :2]
+    task = task_of(env_cfg)
+    return [task.steps_to_end(episode) for episode in trajectories.episodes()]
 
 
 def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:

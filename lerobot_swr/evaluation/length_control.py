@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from lerobot.envs import EnvConfig
 
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.metrics import Histogram, Interval, histogram, l1_distance, l1_floor
 from lerobot_swr.trajectories import Trajectories
 
@@ -47,9 +47,8 @@ class LengthControlResult:
 
 def frames_after_end(trajectories: Trajectories, env_cfg: EnvConfig) -> int:
     """Median number of frames that demonstrations record after the environment would have ended them."""
-    if not isinstance(env_cfg, TaskEnvConfig):
-        return 0
-    steps = [env_cfg.steps_to_end(episode) for episode in trajectories.episodes()]
+    task = task_of(env_cfg)
+    steps = [task.steps_to_end(episode) for episode in trajectories.episodes()]
     return int(np.median(trajectories.lengths - np.array(steps)))
 
 

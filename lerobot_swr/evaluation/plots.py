@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.metrics import Histogram, histogram
 
 MAX_BARS = 24
@@ -45,7 +45,7 @@ def plot_behaviors(
         rollouts: Paths of the rollouts.
         reference: Histogram of the demonstrations.
         shown: Histogram of the rollouts.
-        env_cfg: Draws the scene, if it is one of this package's tasks.
+        env_cfg: Its task draws the scene.
         title: Heading.
     """
     figure = Figure(figsize=(13, 4.4), layout="constrained")
@@ -73,7 +73,7 @@ def plot_comparison(
         path: Where to write the picture.
         demonstrations: Paths of the demonstrations.
         policies: Heading of each further panel and its paths.
-        env_cfg: Draws the scene, if it is one of this package's tasks.
+        env_cfg: Its task draws the scene.
         title: Heading of the picture.
     """
     panels = {"demonstrations": demonstrations, **policies}
@@ -99,8 +99,7 @@ def plot_comparison(
 
 def draw_paths(axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig) -> None:
     """Paths in the scene, coloured by behaviour."""
-    if isinstance(env_cfg, TaskEnvConfig):
-        env_cfg.draw_scene(axes)
+    task_of(env_cfg).draw_scene(axes)
     for points, label in paths:
         axes.plot(*points.T, color=colors[label], linewidth=0.8, alpha=0.8)
     axes.set_aspect("equal")

@@ -7,7 +7,7 @@ from typing import Any
 from lerobot.envs import EnvConfig
 
 from lerobot_swr.behaviors import BehaviorRule
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.behavior_evaluation import (
     BehaviorResult,
     allowed_episodes,
@@ -80,7 +80,7 @@ def perturbed(env_cfg: EnvConfig) -> dict[str, dict[str, Any]]:
     Raises:
         ValueError: If the environment has none.
     """
-    options = env_cfg.perturbations() if isinstance(env_cfg, TaskEnvConfig) else {}
+    options = task_of(env_cfg).perturbations()
     if not options:
         raise ValueError(
             f"env.type={env_cfg.type!r} names no perturbations; perturb it by its own flags and evaluate "

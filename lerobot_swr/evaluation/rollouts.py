@@ -6,12 +6,12 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from lerobot.envs import EnvConfig, make_env, make_env_pre_post_processors, preprocess_observation
+from lerobot.envs import EnvConfig, make_env_pre_post_processors, preprocess_observation
 from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_swr.behaviors import BehaviorRule
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.styles import BLENDED
 
@@ -80,21 +80,6 @@ def _low_dimensional(observations: dict) -> dict[str, np.ndarray]:
     return {k: np.array(v) for k, v in observations.items() if k != "pixels" and isinstance(v, np.ndarray)}
 
 
-def make_rollout_env(env_cfg: EnvConfig, n_envs: int) -> gym.vector.VectorEnv:
-    """A vector environment in this process.
-
-    Raises:
-        ValueError: If the environment has several tasks.
-    """
-    if isinstance(env_cfg, TaskEnvConfig):
-        return env_cfg.create_rollout_env(n_envs)
-    suites = make_env(env_cfg, n_envs=n_envs, use_async_envs=False)
-    envs = [env for tasks in suites.values() for env in tasks.values()]
-    if len(envs) != 1:
-        raise ValueError(f"env.type={env_cfg.type!r}: {len(envs)} tasks; choose one with --env.task")
-    return envs[0]
-
-
 def run_rollouts(
     checkpoint: Checkpoint,
     env_cfg: EnvConfig,
@@ -123,7 +108,7 @@ def run_rollouts(
     rollouts: list[Rollout] = []
     while len(rollouts) < n_episodes:
         size = min(batch_size, n_episodes - len(rollouts))
-        env = StateRecorder(make_rollout_env(env_cfg, size))
+        env = StateRecorder(task_of(env_cfg).create_rollout_env(size))
         try:
             outcome = rollout(
                 env,

@@ -9,7 +9,7 @@ from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.blending import BlendResult
 from lerobot_swr.evaluation.counterfactual import CounterfactualResult
 from lerobot_swr.evaluation.length_control import BIN_WIDTH, LengthControlResult
@@ -81,7 +81,7 @@ def plot_blends(
         path: Where to write the picture.
         result: The check.
         paths: Path (T, 2) of every rollout.
-        env_cfg: Draws the scene, if it is one of this package's tasks.
+        env_cfg: Its task draws the scene.
         title: Heading.
         examples: Pairs of each kind to draw.
     """
@@ -98,8 +98,7 @@ def plot_blends(
             if not chosen:
                 axes.set_axis_off()
                 continue
-            if isinstance(env_cfg, TaskEnvConfig):
-                env_cfg.draw_scene(axes)
+            task_of(env_cfg).draw_scene(axes)
             for k in chosen:
                 record = result.episodes[k]
                 style = "-" if record["success"] else ":"

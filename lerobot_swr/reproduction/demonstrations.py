@@ -15,8 +15,8 @@ from lerobot_swr.demos.catalog import RECIPES, get_recipe
 from lerobot_swr.demos.d3il_converter import human_name, recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.recipe import DatasetRecipe
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import path_of, steps_to_end
+from lerobot_swr.envs.task import task_of
+from lerobot_swr.evaluation.behavior_evaluation import steps_to_end
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.evaluation.length_control import frames_after_end
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
@@ -114,11 +114,9 @@ def load_low_dimensional(root: Path) -> Trajectories:
     )
 
 
-def environment(options: Mapping[str, Any]) -> TaskEnvConfig:
+def environment(options: Mapping[str, Any]) -> EnvConfig:
     """The environment's configuration from its type and the options that differ from its defaults, or all."""
-    config = draccus.decode(EnvConfig, dict(options))
-    assert isinstance(config, TaskEnvConfig)
-    return config
+    return draccus.decode(EnvConfig, dict(options))
 
 
 def whole_environment(options: Mapping[str, Any]) -> dict[str, Any]:
@@ -132,8 +130,9 @@ def short_path(path: np.ndarray) -> list[list[float]]:
     return np.round(path[chosen].astype(float), 3).tolist()
 
 
-def _describe(trajectories: Trajectories, env_cfg: TaskEnvConfig) -> dict[str, Any]:
-    rule = env_cfg.behavior_rule()
+def _describe(trajectories: Trajectories, env_cfg: EnvConfig) -> dict[str, Any]:
+    task = task_of(env_cfg)
+    rule = task.behavior_rule()
     stride = -(-len(trajectories) // MAX_PATHS)
     return {
         "behavior": [rule(episode) for episode in trajectories.episodes()],
@@ -142,6 +141,6 @@ def _describe(trajectories: Trajectories, env_cfg: TaskEnvConfig) -> dict[str, A
         "frames_after_end": frames_after_end(trajectories, env_cfg),
         "path_episodes": list(range(0, len(trajectories), stride)),
         "paths": [
-            short_path(path_of(env_cfg, trajectories.episode(i))) for i in range(0, len(trajectories), stride)
+            short_path(task.plot_path(trajectories.episode(i))) for i in range(0, len(trajectories), stride)
         ],
     }

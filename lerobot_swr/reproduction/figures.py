@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.length_control import BIN_WIDTH
 from lerobot_swr.evaluation.metrics import histogram
 from lerobot_swr.evaluation.plots import (
@@ -111,7 +112,7 @@ def plot_dissimilarity(path: Path, demonstrations: DatasetDescription, cell: Sto
     panels = np.atleast_1d(figure.subplots(1, len(references)))
     colors = colormaps["viridis_r"]
     for axes, reference, nu in zip(panels, references, cell.result["nu"], strict=True):
-        environment(demonstrations.env).draw_scene(axes)
+        task_of(environment(demonstrations.env)).draw_scene(axes)
         paths = dict(zip(demonstrations.result["path_episodes"], demonstrations.result["paths"], strict=True))
         for episode in sorted(paths, key=lambda i: -nu[i]):  # the similar ones on top
             axes.plot(*np.array(paths[episode]).T, color=colors(nu[episode]), linewidth=0.9)
@@ -134,7 +135,7 @@ def plot_input_distributions(path: Path, demonstrations: DatasetDescription, cel
         axes.imshow(
             grid, origin="lower", extent=(0, 1, 0, 1), cmap="magma_r", norm=PowerNorm(0.5, 0, grid.max())
         )
-        environment(demonstrations.env).draw_scene(axes)
+        task_of(environment(demonstrations.env)).draw_scene(axes)
         axes.set(title=f"β = {float(beta):g}", xticks=[], yticks=[], aspect="equal")
     _save(figure, path)
 

@@ -6,8 +6,7 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 
-from lerobot_swr.envs.configuration_env import TaskEnvConfig
-from lerobot_swr.evaluation.behavior_evaluation import path_of
+from lerobot_swr.envs.task import Task, task_of
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
     DatasetSource,
@@ -67,7 +66,8 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
         # refuses another dataset than the training's
         trajectories = load_reference(source, checkpoint)
     env_cfg = environment(definition["env"])
-    rule = env_cfg.behavior_rule()
+    task = task_of(env_cfg)
+    rule = task.behavior_rule()
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     count = definition["protocols"][protocol]
     env_seed = environment_seed(definition["seed"], seed)
@@ -76,9 +76,9 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
     return {
-        "rollouts": _columns(rollouts, demonstrated, env_cfg),
+        "rollouts": _columns(rollouts, demonstrated, task),
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
-        "paths": [short_path(path_of(env_cfg, rollout.observations)) for rollout in drawn],
+        "paths": [short_path(task.plot_path(rollout.observations)) for rollout in drawn],
     }
 
 
@@ -107,12 +107,12 @@ def load_policy(folder: Path, style_sampling: str | None, style_filter: str | No
     return load_checkpoint(config)
 
 
-def _columns(rollouts: list[Rollout], demonstrated: list[str], env_cfg: TaskEnvConfig) -> dict[str, list]:
+def _columns(rollouts: list[Rollout], demonstrated: list[str], task: Task) -> dict[str, list]:
     def match(rollout: Rollout) -> int | None:
         """Whether it shows what its style's demonstration does, as far as that lies ahead of its start."""
         if rollout.style_episode is None:
             return None
-        expected = env_cfg.expected_behavior(demonstrated[rollout.style_episode], rollout.observations)
+        expected = task.expected_behavior(demonstrated[rollout.style_episode], rollout.observations)
         return int(rollout.behavior == expected)
 
     return {

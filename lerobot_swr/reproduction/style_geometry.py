@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import environment, load_low_dimensional
 from lerobot_swr.reproduction.measurement import load_policy
@@ -70,7 +71,7 @@ def compute_similarity(cell: Cell, dataset: Path) -> dict[str, Any]:
     """
     trajectories = load_low_dimensional(dataset)
     nu = dissimilarity_matrix(trajectories.states(_observations(trajectories)))
-    rule = environment(cell.definition["env"]).behavior_rule()
+    rule = task_of(environment(cell.definition["env"])).behavior_rule()
     behaviors = np.array([rule(episode) for episode in trajectories.episodes()])
     names, counts = np.unique(behaviors, return_counts=True)
     frequent = names[np.argsort(-counts, kind="stable")][: cell.definition["references"]]
@@ -105,7 +106,7 @@ def compute_style_map(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]
     demonstration of the same behaviour.
     """
     assert cell.needs is not None
-    rule = environment(cell.definition["env"]).behavior_rule()
+    rule = task_of(environment(cell.definition["env"])).behavior_rule()
     behaviors = np.array([rule(episode) for episode in load_low_dimensional(dataset).episodes()])
     agreement, flat = [], None
     for seed in cell.needs.definition["seeds"]:

@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
 from lerobot_swr.reproduction.demonstrations import (
@@ -110,7 +111,7 @@ def _table1(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[C
     for policy in settings.choose_policies(known_policies()):
         trained = training(settings, demos, policy)
         yield evaluation(settings, demos, trained, UNPERTURBED)
-        if environment(demos.env).draws_scenes:
+        if task_of(environment(demos.env)).draws_scenes:
             # What the paper presumably does: its BC succeeds in all rollouts of a seed or in almost none.
             yield evaluation(settings, demos, trained, ONE_SCENE, protocols=("uniform",), one_scene=True)
 
@@ -151,7 +152,7 @@ def perturbations(demos: Demonstrations) -> Conditions:
     """
     if demos.env["type"] == "maze2d":
         return {**_maze_conditions(), **_stratified(STICKY_WALLS)}
-    offered = environment(demos.env).perturbations()
+    offered = task_of(environment(demos.env)).perturbations()
     if not offered:
         raise ValueError(f"datasets: {demos.name!r}: its environment names no perturbations")
     return {UNPERTURBED: ({}, BOTH_PROTOCOLS), **_stratified(offered)}
