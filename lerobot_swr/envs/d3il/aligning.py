@@ -1,14 +1,13 @@
 """The aligning task: move an open box onto a target pose, from its inside or from its outside."""
 
 import math
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
 
 from lerobot_swr.envs.d3il.arm import N_JOINTS
-from lerobot_swr.envs.d3il.arm_task import ArmTask, Observation
+from lerobot_swr.envs.d3il.arm_task import ArmTask, Observation, given_numbers
 from lerobot_swr.envs.d3il.behavior import is_aligned, is_inside, rotation_distance
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import (
@@ -47,12 +46,14 @@ class PlanarPose(NamedTuple):
 
     x: float
     y: float
-    angle: float
+    angle_rad: float
 
     @property
     def pose(self) -> np.ndarray:
         """(7,) position at z = 0 and quaternion (wxyz)."""
-        return np.array([self.x, self.y, 0.0, math.cos(self.angle / 2), 0.0, 0.0, math.sin(self.angle / 2)])
+        return np.array(
+            [self.x, self.y, 0.0, math.cos(self.angle_rad / 2), 0.0, 0.0, math.sin(self.angle_rad / 2)]
+        )
 
 
 class AligningEnv(ArmTask):
@@ -73,7 +74,8 @@ class AligningEnv(ArmTask):
 
     **Start**: the arm always at (0.525, -0.349, 0.252). Box and target are drawn uniformly from the seed: box
     x 0.4 to 0.6, y -0.25 to -0.1, target x 0.4 to 0.6, y 0.2 to 0.35, both angles -90 to 90 degrees; or given
-    by `reset(options={"box": [x, y, angle_rad], "target": [x, y, angle_rad]})`, either or both.
+    by `reset(options={"box": [x, y, angle_rad], "target": [x, y, angle_rad]})`, either or both. The arm
+    starts where a recording does by `"agent_pos": [...]`, see `ArmTask.reset`.
 
     **Reward**: -3.5 |box - target| - rotation distance / pi.
 
@@ -164,21 +166,10 @@ class AligningEnv(ArmTask):
 
 
 def _given_pose(options: dict[str, Any], name: str) -> PlanarPose | None:
-    """The pose that `reset(options=...)` gives for `name`, if it does.
-
-    Raises:
-        ValueError: If it is not three finite numbers.
-    """
+    """The pose [x, y, angle_rad] that `reset(options=...)` gives for `name`, if it does."""
     if options.get(name) is None:
         return None
-    values: Sequence[float] | np.ndarray = options[name]
-    try:
-        numbers = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        numbers = np.empty(0)
-    if numbers.shape != (3,) or not np.isfinite(numbers).all():
-        raise ValueError(f"options[{name!r}]={values!r}: expected three finite numbers [x, y, angle_rad]")
-    return PlanarPose(*map(float, numbers))
+    return PlanarPose(*given_numbers(options, name, PlanarPose._fields).tolist())
 
 
 def _draw_pose(

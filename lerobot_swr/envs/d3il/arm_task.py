@@ -1,6 +1,7 @@
 """What the two D3IL tasks share as Gymnasium environments: the set-point, the clock and the pictures."""
 
 import abc
+from collections.abc import Sequence
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -8,9 +9,9 @@ import numpy as np
 
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, FPS
-from lerobot_swr.envs.d3il.perturbations import SETTLING_STEPS, ArmPerturbations
+from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.d3il.rendering import OffscreenCamera
-from lerobot_swr.envs.d3il.simulation import ArmSimulation
+from lerobot_swr.envs.d3il.simulation import SETTLING_STEPS, ArmSimulation
 
 Observation = dict[str, np.ndarray]
 
@@ -69,10 +70,22 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Put the arm into its start pose and begin an episode; the class says what the arguments do."""
+        """Put the arm into its start pose and begin an episode; the class says what the arguments do.
+
+        ``options["agent_pos"]``, desired and actual tool position as they are observed, is where a recording
+        begins: the arm moves there from its start pose, see `ArmSimulation.approach`.
+        """
         super().reset(seed=seed)
+        options = options or {}
         self._desired = self._start_tool.copy()
-        self._begin_episode(options or {})
+        self._begin_episode(options)
+        if options.get("agent_pos") is not None:
+            axes = ("x", "y", "z")[: self._n_axes]
+            given = given_numbers(options, "agent_pos", [f"desired_{axis}" for axis in axes] + [*axes])
+            desired, actual = given.reshape(2, -1)
+            self._desired[: self._n_axes] = desired
+            self._simulation.approach(self._desired, actual)
+            return self._observation(), self._info()
         shift = self._perturbations.draw_shift(self.np_random)
         if shift.any():
             self._desired += shift
@@ -133,3 +146,20 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
 
     @abc.abstractmethod
     def _is_over(self) -> bool: ...
+
+
+def given_numbers(options: dict[str, Any], name: str, meanings: Sequence[str]) -> np.ndarray:
+    """(n,) float64 of what `reset(options=...)` gives for `name`.
+
+    Raises:
+        ValueError: If it is not a finite number for each of the n meanings.
+    """
+    try:
+        numbers = np.asarray(options[name], dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (len(meanings),) or not np.isfinite(numbers).all():
+        raise ValueError(
+            f"options[{name!r}]={options[name]!r}: expected finite numbers [{', '.join(meanings)}]"
+        )
+    return numbers

@@ -38,8 +38,8 @@ class AvoidingEnv(ArmTask):
     **Action** (2): change of the desired tool x, y in metres per step, clipped to +-0.05. The desired height
     stays 0.122 m. One step is 35 ms; demonstrations move 5 to 9 mm per step.
 
-    **Start**: always the same pose, tool at (0.525, -0.280); `seed` and `options` change nothing, unless a
-    perturbation draws from the seed.
+    **Start**: always the same pose, tool at (0.525, -0.280), unless a perturbation draws from the seed; or
+    where a recording starts, by `reset(options={"agent_pos": [...]})`, see `ArmTask.reset`.
 
     **Reward**: 1 on reaching the finish line, else 0.
 

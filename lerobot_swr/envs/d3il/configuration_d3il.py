@@ -31,6 +31,8 @@ from lerobot_swr.envs.d3il.layouts import (
     TARGET_POSITION_RANGE,
 )
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
+from lerobot_swr.envs.d3il.recorded_starts import aligning_start, avoiding_start
+from lerobot_swr.envs.task import StartRule
 from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
 
 GYM_IDS = {"avoiding": "lerobot_swr/D3IL-Avoiding-v0", "aligning": "lerobot_swr/D3IL-Aligning-v0"}
@@ -142,6 +144,10 @@ class D3ILEnvConfig(TaskEnvConfig):
     def draws_scenes(self) -> bool:
         """In aligning, where box and target stand."""
         return self.task == "aligning"
+
+    def start_rule(self) -> StartRule:
+        """The tool's place and, for aligning, those of box and target."""
+        return avoiding_start if self.task == "avoiding" else aligning_start
 
     def perturbations(self) -> dict[str, dict[str, Any]]:
         """Shifted starts, noisy actions and, for aligning, a pushed box."""

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-SETTLING_STEPS = 80
-"""Control periods in which the arm moves to a shifted start and comes to rest before an episode begins."""
 PUSH_STEPS = (10, 150)
 """First and last step before which the box may be pushed."""
 GRAVITY = 9.81

@@ -19,6 +19,7 @@ from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.dynamics import in_goal
 from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import get_layout
+from lerobot_swr.envs.task import StartRule
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
 
@@ -108,6 +109,10 @@ class Maze2DEnvConfig(TaskEnvConfig):
     def behavior_rule(self) -> BehaviorRule:
         """The checkpoints in the order in which they are first passed."""
         return MazeBehaviorRule(get_layout(self.task or ""))
+
+    def start_rule(self) -> StartRule:
+        """The agent's first recorded position, which is all of the maze's state."""
+        return lambda observations: {"agent_pos": observations[OBS_STATE][0]}
 
     def steps_to_end(self, observations: Mapping[str, np.ndarray]) -> int:
         """Actions until the first state in the goal disc."""

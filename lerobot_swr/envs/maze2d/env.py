@@ -36,6 +36,20 @@ class MazeAgents:
         self.start, self.start_radius = start, start_radius
         self.transition_noise, self.sticky_walls = transition_noise, sticky_walls
 
+    def begin(self, rng: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
+        """(2,) start position of one episode: that of ``options["agent_pos"]``, or else a drawn one.
+
+        Raises:
+            ValueError: If the position that is given is not one of the maze.
+        """
+        given = (options or {}).get("agent_pos")
+        if given is None:
+            return self.draw_start(rng)
+        position = np.asarray(given, dtype=np.float64)
+        if position.shape != (2,) or not ((position >= 0) & (position <= 1)).all():
+            raise ValueError(f"options['agent_pos']={given!r}: expected x and y in the maze, 0 to 1")
+        return position
+
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
         """(2,) start position of one episode."""
         start = np.array(self.layout.start)
@@ -89,7 +103,7 @@ class Maze2DEnv(gym.Env):
     are clipped. Walls and the border stop the agent; by default it slides along them.
 
     **Start**: `fixed` (the layout's start), `pseudo_random` (uniform in a square around it, cut at the
-    border) or `random` (uniform in the maze).
+    border) or `random` (uniform in the maze); or given by `reset(options={"agent_pos": [x, y]})`.
 
     **Reward**: 1 when the goal is reached, else 0. **Termination**: goal reached. **Truncation**: by the
     registered step limit (200).
@@ -138,9 +152,9 @@ class Maze2DEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode; `options` are ignored."""
+        """Start an episode; the class says what the arguments do."""
         super().reset(seed=seed)
-        self._path = [self.agents.draw_start(self.np_random)]
+        self._path = [self.agents.begin(self.np_random, options)]
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
@@ -186,18 +200,26 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
         self._positions: np.ndarray = np.zeros((num_envs, 2))
         self._terminated = np.zeros(num_envs, dtype=bool)
-        self._steps = 0
+        self._steps = np.zeros(num_envs, dtype=int)
 
     def reset(  # type: ignore[override]
         self, *, seed: int | list[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start an episode for every agent; `seed` as in Gymnasium's vector environments."""
+        """Start an episode for every agent, or those of ``options["reset_mask"]`` (n,).
+
+        Seeds and options are as in Gymnasium's vector environments.
+        """
+        chosen = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         if seed is not None:
             seeds = [seed + i for i in range(self.num_envs)] if isinstance(seed, int) else seed
-            self._rngs = [gym.utils.seeding.np_random(s)[0] for s in seeds]
-        self._positions = np.stack([self.agents.draw_start(rng) for rng in self._rngs])
-        self._terminated = np.zeros(self.num_envs, dtype=bool)
-        self._steps = 0
+            fresh = [gym.utils.seeding.np_random(s)[0] for s in seeds]
+            self._rngs = [
+                new if use else old for use, new, old in zip(chosen, fresh, self._rngs, strict=True)
+            ]
+        for i in np.flatnonzero(chosen):
+            self._positions[i] = self.agents.begin(self._rngs[i], options)
+        self._terminated[chosen] = False
+        self._steps[chosen] = 0
         return self.agents.observe(self._positions), {"is_success": self._terminated.copy()}
 
     def step(
@@ -210,7 +232,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         reward = (reached & under_way).astype(np.float64)
         self._terminated = self._terminated | (reached & under_way)
         self._steps += 1
-        truncated = np.full(self.num_envs, self._steps >= self._max_episode_steps) & ~self._terminated
+        truncated = (self._steps >= self._max_episode_steps) & ~self._terminated
         info = {"is_success": self._terminated.copy()}
         return self.agents.observe(self._positions), reward, self._terminated.copy(), truncated, info
 
