@@ -2,8 +2,9 @@
 
 import hashlib
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
@@ -164,3 +165,24 @@ def _joined(names: str | Sequence[str | None] | None) -> str:
     if names is None or isinstance(names, str):
         return names or ""
     return "; ".join(name for name in names if name)
+
+
+def dimension_names(meta: LeRobotDatasetMetadata, keys: Sequence[str]) -> dict[str, list[str]]:
+    """Feature name to the names of its dimensions, or their numbers where the dataset names none.
+
+    Args:
+        meta: Metadata of the dataset.
+        keys: The features.
+    """
+    return {key: _names(meta.features[key]) for key in keys}
+
+
+def _names(feature: Mapping[str, Any]) -> list[str]:
+    def leaves(names: Any) -> Iterator[str]:
+        """LeRobot's names are a list, or such lists under the name of a group."""
+        for name in names.values() if isinstance(names, dict) else names or ():
+            yield from leaves(name) if isinstance(name, list | dict) else [str(name)]
+
+    width = int(np.prod(feature["shape"]))
+    names = list(leaves(feature.get("names")))
+    return names if len(names) == width else [str(i) for i in range(width)]

@@ -174,7 +174,7 @@ def test_flags_without_effect_are_refused(run_command, small_maze, tmp_path, cap
 @pytest.mark.parametrize(
     ("flags", "message"),
     [
-        (("--baseline=replay", *ENV), "baseline='replay': expected 'playback'"),
+        (("--baseline=rewind", *ENV), "baseline='rewind': expected 'playback' or 'replay'"),
         (("--baseline=playback", "--policy.path=x", *ENV), "leave out --policy.path"),
         (("--baseline=playback",), "acts in an environment"),
         (("--baseline=playback", "--blend=3", *ENV), "no styles to blend"),

@@ -8,13 +8,21 @@ Examples:
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from lerobot.configs import parser
+from lerobot.envs import make_env_config
 from lerobot.utils.utils import init_logging
 
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.d3il_converter import recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
+from lerobot_swr.envs.task import task_of
+from lerobot_swr.evaluation.checkpoint import DatasetSource
+from lerobot_swr.evaluation.replay import run_replay, summarize
+
+REPLAYED_FRAMES = 10_000
+"""About as many frames of converted recordings are replayed, of episodes spread over all of them."""
 
 
 @dataclass
@@ -34,7 +42,8 @@ class DatasetCommand:
     repo_id: str | None = None
     # Replace a dataset that is already in the folder.
     overwrite: bool = False
-    # Convert the D3IL benchmark's own recordings (*.pkl) in this folder instead.
+    # Convert the D3IL benchmark's own recordings (*.pkl) in this folder instead, and replay a
+    # sample of them in the simulator.
     from_d3il: Path | None = None
     # With from_d3il: a pickled list of the file names to convert; default: all of them.
     file_list: Path | None = None
@@ -52,6 +61,23 @@ def write(cfg: DatasetCommand) -> None:
     print(f"{total} episodes of {recipe.name} in {cfg.root}")
     for behavior, count in histogram.most_common():
         print(f"  {behavior:>12} {count:4d}  {'#' * round(40 * count / max(histogram.values()))}")
+    if cfg.from_d3il is not None:
+        print(_replay(cfg.root))
+
+
+def _replay(root: Path) -> str:
+    """Whether the converted recordings and our simulator agree, on a sample that takes seconds."""
+    meta = DatasetSource(root=root).metadata()
+    env_type, task = str(meta.robot_type).split("_", 1)
+    env_cfg = make_env_config(env_type, task=task)
+    n = max(1, round(REPLAYED_FRAMES * meta.total_episodes / meta.total_frames))
+    episodes = np.linspace(0, meta.total_episodes - 1, min(n, meta.total_episodes)).round().astype(int)
+    try:
+        rule = task_of(env_cfg).behavior_rule()
+        result, *_ = run_replay(meta, env_cfg, rule, episodes.tolist())
+    except ModuleNotFoundError as error:
+        return f"not replayed in the simulator: {error}"
+    return summarize(result)
 
 
 @explain_errors

@@ -8,6 +8,8 @@ Examples:
         --n_episodes=100 --style_sampling=stratified
 
     lerobot-swr-eval --policy.path=... --dataset.root=path/to/real_robot_dataset
+
+    lerobot-swr-eval --baseline=replay --env.type=d3il --env.task=avoiding --dataset.root=data/recorded
 """
 
 import sys
@@ -25,7 +27,7 @@ from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.eval_options import EvalCommand
 from lerobot_swr.cli.literal_flags import with_literal_text
-from lerobot_swr.envs.task import task_of
+from lerobot_swr.envs.task import MissingRuleError, task_of
 from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
 from lerobot_swr.evaluation.checkpoint import (
@@ -44,6 +46,8 @@ from lerobot_swr.evaluation.length_control import (
 from lerobot_swr.evaluation.offline import KINDS, format_offline, frame_errors, summarize
 from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
+from lerobot_swr.evaluation.replay import format_replay, run_replay
+from lerobot_swr.evaluation.replay_plots import plot_replay
 from lerobot_swr.evaluation.robustness import format_robustness, run_robustness
 from lerobot_swr.evaluation.steering_plots import plot_blends, plot_counterfactual, plot_length_control
 from lerobot_swr.trajectories import Trajectories
@@ -55,6 +59,9 @@ TEXT_FLAGS = ("behavior_rule", "policy.style_filter")
 def evaluate(cfg: EvalCommand) -> None:
     """Evaluate a checkpoint by rollouts, or offline without an environment."""
     assert cfg.output_dir is not None
+    if cfg.baseline == "replay":
+        _replay(cfg)
+        return
     checkpoint, trajectories = _load(cfg)
     title = f"{checkpoint.policy.config.type} on {Path(trajectories.name).name}"
     if cfg.env is None:
@@ -132,6 +139,24 @@ def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
     if cfg.env is not None:
         check_environment(cfg.env, checkpoint.shapes, cfg.rename_map, "the checkpoint")
     return checkpoint, load_reference(cfg.dataset, checkpoint, needs_actions=cfg.env is None)
+
+
+def _replay(cfg: EvalCommand) -> None:
+    """Play the dataset's actions and compare what the environment shows with what was recorded."""
+    assert cfg.env is not None
+    assert cfg.output_dir is not None
+    try:
+        rule = _rule(cfg)
+    except MissingRuleError:
+        rule = None  # success and deviation do not need one
+    meta = cfg.dataset.metadata()
+    result, recorded, observed = run_replay(
+        meta, cfg.env, rule, cfg.dataset.episodes, cfg.batch_size, cfg.seed
+    )
+    write_json(cfg.output_dir / "replay.json", result, _provenance(cfg))
+    title = f"replay of {meta.root.name}: {result.finding}"
+    plot_replay(cfg.output_dir / "replay.png", result, recorded, observed, task_of(cfg.env), title)
+    print(f"replay of {meta.root.name}\n{format_replay(result)}\nwritten to {cfg.output_dir}")
 
 
 def _steer(cfg: EvalCommand, checkpoint: Checkpoint, trajectories: Trajectories, title: str) -> None:

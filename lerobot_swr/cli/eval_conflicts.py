@@ -16,6 +16,14 @@ CONFLICTS = {
     "length_band": ("dataset.episodes",),
     "style_sampling": ("policy.style_sampling",),
     "baseline": ("rename_map", "policy.*"),
+    "baseline=replay": (
+        "robustness",
+        "counterfactual",
+        "blend",
+        "length_band",
+        "n_episodes",
+        "style_sampling",
+    ),
 }
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),

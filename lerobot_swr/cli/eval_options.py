@@ -9,6 +9,7 @@ from lerobot.envs import EnvConfig
 
 from lerobot_swr.cli.eval_conflicts import refuse_conflicts
 from lerobot_swr.configuration import check_checkpoint_path
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.styles import check_style_sampling
 
@@ -23,7 +24,8 @@ class EvalCommand:
     env: EnvConfig | None = None
     # Give the checkpoint as --policy.path=FOLDER; other --policy.* flags override its configuration.
     policy: PreTrainedConfig | None = None
-    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback.
+    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback, "replay" plays
+    # every one's recorded actions from its recorded start and says whether data and environment agree.
     baseline: str | None = None
     # Number of rollouts.
     n_episodes: int = 100
@@ -86,6 +88,7 @@ class EvalCommand:
             "dataset.episodes": self.dataset.episodes is not None,
             "rename_map": bool(self.rename_map),
             "baseline": self.baseline is not None,
+            "baseline=replay": self.baseline == "replay",
             "policy.style_sampling": _overrides("style_sampling"),
             "policy.style_interpolate": _overrides("style_interpolate"),
             "policy.*": self.policy is not None or bool(_policy_overrides()),
@@ -99,8 +102,8 @@ class EvalCommand:
     def _find_policy(self) -> None:
         path = parser.get_path_arg("policy")
         if self.baseline is not None:
-            if self.baseline != "playback":
-                raise ValueError(f"baseline={self.baseline!r}: expected 'playback'")
+            if self.baseline not in ("playback", "replay"):
+                raise ValueError(f"baseline={self.baseline!r}: expected 'playback' or 'replay'")
             if path:
                 raise ValueError(
                     f"baseline={self.baseline!r} takes the place of a policy: leave out --policy.path"
@@ -110,6 +113,8 @@ class EvalCommand:
                     f"baseline={self.baseline!r} has no styles to blend and acts in an environment: give "
                     "--env.type=... and leave out --blend"
                 )
+            if self.baseline == "replay":
+                task_of(self.env).start_rule()  # refuses environments that have none
             if self.robustness:
                 self.style_sampling = self.style_sampling or "stratified"
             return
