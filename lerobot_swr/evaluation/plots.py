@@ -109,7 +109,8 @@ def draw_paths(axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]]
 def draw_histograms(axes: Axes, reference: Histogram, shown: Histogram) -> None:
     """Shares of the behaviours of demonstrations and rollouts side by side, most demonstrated first."""
     labels = list({**reference, **shown})
-    kept, others = labels[:MAX_BARS], labels[MAX_BARS:]
+    most = MAX_BARS if len(labels) > MAX_BARS + 1 else len(labels)  # one more has room for its own name
+    kept, others = labels[:most], labels[most:]
     rows: list[tuple[str, float, float]] = [
         (label or "(none)", reference.get(label, 0.0), shown.get(label, 0.0)) for label in kept
     ]
