@@ -4,7 +4,8 @@ Reading order, along the way data takes:
 
 * `lerobot_swr.envs`: the simulated tasks (mazes, ...).
 * `lerobot_swr.demos`: scripted demonstrators and the recipes that write LeRobot datasets.
-* `lerobot_swr.trajectories`: episodes of a dataset as arrays.
+* `lerobot_swr.dataset_files`, `lerobot_swr.trajectories`: episodes of a dataset as arrays, read as LeRobot
+  reads them; `lerobot_swr.dataset_checks`, `lerobot_swr.dataset_statistics`: what is asked of them.
 * `lerobot_swr.similarity`, `lerobot_swr.sampling`, `lerobot_swr.styles`: the method.
 * `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies, and the baselines BESO, DDPM-GPT, DDPM-ACT.
 * `lerobot_swr.training`: many seeds at once.

@@ -45,8 +45,8 @@ def check_format(root: Path, repo_id: str | None = None) -> None:
     if version.major < current.major:
         first = "" if version >= packaging.version.parse("2.1") else "to v2.1 with an earlier LeRobot, then "
         raise ValueError(
-            f"{where} has LeRobot's format v{version}, this LeRobot reads {CODEBASE_VERSION}: convert it, "
-            f"{first}in its place, with: python -m lerobot.scripts.convert_dataset_v21_to_v30 "
+            f"{where} has LeRobot's format v{version}, this LeRobot reads {CODEBASE_VERSION}: convert it "
+            f"{first}in its place with: python -m lerobot.scripts.convert_dataset_v21_to_v30 "
             f"--repo-id={repo_id or f'local/{root.name}'} --root={shlex.quote(str(root))} --push-to-hub=false"
         )
     if version.major > current.major:

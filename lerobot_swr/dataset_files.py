@@ -5,7 +5,7 @@ LeRobot numbers frames by their place in the data files, sorted by name, and cas
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,7 +125,7 @@ def read_frames(meta: LeRobotDatasetMetadata, keys: Sequence[str], optional: Seq
     index: list[np.ndarray] = []
     tasks: list[np.ndarray] = []
     for path in files:
-        table = _read(path, ["episode_index", "index", "task_index", *parts], name)
+        table = _read(path, dict.fromkeys(["episode_index", "index", "task_index", *parts]), name)
         owners.append(_integers(table, "episode_index", path, name))
         index.append(_integers(table, "index", path, name))
         if "task_index" in table.column_names:
@@ -159,7 +159,7 @@ def read_frames(meta: LeRobotDatasetMetadata, keys: Sequence[str], optional: Seq
     return Frames(lengths, columns, task_index, None if in_turn else numbers)
 
 
-def _read(path: Path, columns: Sequence[str], name: str) -> pa.Table:
+def _read(path: Path, columns: Iterable[str], name: str) -> pa.Table:
     try:
         known = pq.read_schema(path).names
         return pq.read_table(path, columns=[key for key in columns if key in known], partitioning=None)

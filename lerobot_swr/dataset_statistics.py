@@ -10,6 +10,7 @@ from lerobot.configs import NormalizationMode
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_swr.dataset_checks import edit_command
+from lerobot_swr.dataset_files import is_numeric
 
 Statistics = dict[str, dict[str, Any]]
 
@@ -178,10 +179,10 @@ def _check_quantiles(
 
 
 def _error(meta: LeRobotDatasetMetadata, reason: str) -> ValueError:
-    command = edit_command(meta, "recompute_stats")
-    return ValueError(
-        f"dataset {meta.root}: {reason}; compute the statistics anew: {command} --operation.overwrite=true"
-    )
+    command = f"{edit_command(meta, 'recompute_stats')} --operation.overwrite=true"
+    if any(is_numeric(ft) and len(ft["shape"]) > 1 for ft in meta.features.values()):
+        command = "see docs/datasets.md (LeRobot's own command fails on features of several dimensions)"
+    return ValueError(f"dataset {meta.root}: {reason}; compute the statistics anew: {command}")
 
 
 def _vector(value: Any, shape: Sequence[int]) -> np.ndarray | None:

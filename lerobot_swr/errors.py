@@ -6,9 +6,10 @@ from datasets.exceptions import DatasetGenerationError
 from draccus.utils import ParsingError
 from lerobot.datasets.utils import CompatibilityError
 from safetensors import SafetensorError
+from yaml import YAMLError
 
 USER_ERRORS = (
-    *(ValueError, OSError, ParsingError),
+    *(ValueError, OSError, ParsingError, YAMLError),
     *(SafetensorError, CompatibilityError, DatasetGenerationError, NotImplementedError),
 )
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -3,6 +3,7 @@
 import json
 import logging
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -150,3 +151,27 @@ def test_statistics_that_nothing_needs_are_not_looked_at(copied_arcs):
     """Without normalisation, or of features that the policy does not use."""
     change_statistics(copied_arcs, lambda stats: stats.clear())
     make(copied_arcs, mapping={"STATE": "IDENTITY", "ACTION": "IDENTITY"})
+
+
+def test_the_documented_computation_does_for_grids_what_lerobots_command_does_not(tmp_path):
+    """The lines of docs/datasets.md, on a dataset whose statistics are gone: as LeRobot wrote them."""
+    features = {**PLAIN, "observation.grid": feature(2, 3), "observation.on": feature(1, dtype="bool")}
+    root = write(
+        tmp_path / "data",
+        features,
+        lambda i, t, n: {
+            **arcs(i, t, n),
+            "observation.grid": np.outer([1, t], [i, 1, t]).astype(np.float32),
+            "observation.on": np.array([t % 2 == 1]),
+        },
+    )
+    written = metadata(root).stats
+    (root / "meta/stats.json").unlink()
+    with pytest.raises(ValueError, match=r"has no mean .* compute the statistics anew: see docs/datasets.md"):
+        make(root)
+    page = (Path(__file__).parent.parent / "docs/datasets.md").read_text()
+    exec(page.split("```python\n")[1].split("```")[0].replace("DATASET", str(root)), {})
+    make(root)
+    for key in features:
+        for name in ("mean", "std", "min", "max"):
+            np.testing.assert_allclose(metadata(root).stats[key][name], written[key][name], rtol=1e-5)

@@ -27,6 +27,7 @@ from lerobot_swr.behaviors import BehaviorRule, load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.eval_options import EvalCommand
 from lerobot_swr.cli.literal_flags import with_literal_text
+from lerobot_swr.configuration import check_dataset_folder
 from lerobot_swr.envs.task import MissingRuleError, task_of
 from lerobot_swr.evaluation.behavior_evaluation import compare, format_result, write_json
 from lerobot_swr.evaluation.blending import format_blends, run_blends
@@ -211,4 +212,5 @@ def main() -> None:
     init_logging()
     register_third_party_plugins()
     sys.argv = list(with_literal_text(sys.argv, TEXT_FLAGS))
+    check_dataset_folder()  # the parser would hide what it says
     evaluate()

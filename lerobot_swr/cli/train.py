@@ -16,6 +16,7 @@ from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
 from lerobot_swr.cli.errors import explain_errors
+from lerobot_swr.configuration import check_dataset_folder
 from lerobot_swr.training import SeedsTrainConfig, train_seeds
 
 
@@ -37,6 +38,7 @@ def main() -> None:
             f"seed={parser.parse_arg('seed')}: this command takes --seeds={parser.parse_arg('seed')}"
         )
     sys.argv = list(_with_brackets(sys.argv))
+    check_dataset_folder()  # the parser would hide what it says
     train()
 
 

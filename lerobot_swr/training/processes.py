@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.process import BaseProcess
 
+from tqdm import tqdm
+
 from lerobot_swr.errors import USER_ERRORS, one_line
 
 
@@ -83,6 +85,8 @@ def _ignoring_interrupts() -> Iterator[None]:
 @contextmanager
 def explained_exit() -> Iterator[None]:
     """In such a process: print the message of an input error and exit with status 2."""
+    # The lock of tqdm's own would outlive a process that is ended, and Python would warn of it.
+    tqdm.set_lock(threading.RLock())
     try:
         yield
     except USER_ERRORS as error:

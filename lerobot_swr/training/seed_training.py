@@ -113,27 +113,26 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[],
     places = dataset.absolute_to_relative_idx
     orders = [FrameOrder(starts, ends, dataset.episodes, seed, config.batch_size, places) for seed in seeds]
     frames = _prepared_frames(runs, dataset)
-    bar = tqdm(
+    window: list[Tensor] = []
+    with tqdm(
         total=config.steps * len(seeds),
         initial=runs.step * len(seeds),
         desc="Training",
         unit="seed-step",
         disable=count is not None,
-    )
-    window: list[Tensor] = []
-    while runs.step < config.steps:
-        for drawn in _draw(runs, orders, frames, min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))):
-            window.append(runs.stack.step(drawn))
-            runs.step += 1
-            bar.update(len(seeds))
-            if count is not None:
-                count()
-            if runs.step % (config.log_freq or STEPS_AT_ONCE) == 0:
-                window = _report(seeds, runs.step, window, config.log_freq > 0)
-        if should_save_checkpoint(runs.step, config.save_freq, config.steps):
-            window = _report(seeds, runs.step, window, False)
-            runs.save()
-    bar.close()
+    ) as bar:
+        while runs.step < config.steps:
+            for drawn in _draw(runs, orders, frames, min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))):
+                window.append(runs.stack.step(drawn))
+                runs.step += 1
+                bar.update(len(seeds))
+                if count is not None:
+                    count()
+                if runs.step % (config.log_freq or STEPS_AT_ONCE) == 0:
+                    window = _report(seeds, runs.step, window, config.log_freq > 0)
+            if should_save_checkpoint(runs.step, config.save_freq, config.steps):
+                window = _report(seeds, runs.step, window, False)
+                runs.save()
 
 
 def _report(seeds: list[int], step: int, losses: list[Tensor], log: bool) -> list[Tensor]:
