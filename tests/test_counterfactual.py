@@ -45,7 +45,7 @@ def test_path_distance_pads_with_the_last_state():
 def make_rollout(states: list[float], behavior: str, style: int) -> Rollout:
     """A rollout on a line."""
     observations = {"observation.state": np.array(states)[:, None]}
-    return Rollout(observations, behavior, True, len(states) - 1, style)
+    return Rollout(observations, behavior, True, len(states) - 1, 1.0, style)
 
 
 def test_the_confusion_matrix_counts_and_distances_are_to_the_requested_demonstration():

@@ -200,7 +200,7 @@ def test_style_match_and_length_error_follow_the_requested_demonstrations():
     """Recomputed by hand: the length error is over successes that show what was asked for."""
 
     def rollout(y, behavior, success, length, episode):
-        return Rollout({STATE: np.array([[0.5, y]])}, behavior, success, length, episode)
+        return Rollout({STATE: np.array([[0.5, y]])}, behavior, success, length, float(success), episode)
 
     rollouts = [
         rollout(0.1, "6410", True, 50, 0),  # as asked, 2 steps longer

@@ -21,6 +21,7 @@ from lerobot_swr.evaluation.metrics import (
     l1_distance,
     l1_floor,
     l1_interval,
+    mean_interval,
     median_interval,
     style_fidelity,
     success_entropy,
@@ -39,6 +40,9 @@ class BehaviorResult:
         n_episodes: Number of rollouts.
         success_rate: Share of successes.
         success_interval: Its Wilson 95 % interval.
+        max_reward: Mean over rollouts of an episode's largest reward; for tasks that reward partial success
+            (PushT's usual score).
+        max_reward_interval: Its bootstrap 95 % interval over rollouts.
         l1: L1 distance of the two histograms, 0 to 2.
         l1_interval: Its bootstrap 95 % interval over rollouts.
         l1_floor: L1 that a perfect reproducer of the demonstrations would score on average.
@@ -60,6 +64,8 @@ class BehaviorResult:
     n_episodes: int
     success_rate: float
     success_interval: Interval
+    max_reward: float
+    max_reward_interval: Interval
     l1: float
     l1_interval: Interval
     l1_floor: float
@@ -98,6 +104,7 @@ def evaluate_behaviors(
     """
     labels = [rollout.behavior for rollout in rollouts]
     successes = [rollout.success for rollout in rollouts]
+    rewards = [rollout.max_reward for rollout in rollouts]
     chosen = range(len(demonstrated)) if reference_episodes is None else reference_episodes
     reference = [demonstrated[i] for i in chosen]
     reference_histogram = histogram(reference)
@@ -125,6 +132,8 @@ def evaluate_behaviors(
         n_episodes=len(rollouts),
         success_rate=sum(successes) / len(successes),
         success_interval=success_interval(successes),
+        max_reward=float(np.mean(rewards)),
+        max_reward_interval=mean_interval(rewards),
         l1=l1_distance(histogram(labels), reference_histogram),
         l1_interval=l1_interval([labels], reference_histogram),
         l1_floor=floor.mean,
@@ -142,6 +151,7 @@ def evaluate_behaviors(
                 "behavior": rollout.behavior,
                 "success": rollout.success,
                 "length": rollout.length,
+                "max_reward": rollout.max_reward,
                 "style_episode": rollout.style_episode,
             }
             for rollout in rollouts
@@ -241,6 +251,7 @@ def format_result(result: BehaviorResult) -> str:
     rows = [
         ("rollouts", f"{result.n_episodes}", f"styles drawn: {result.style_sampling or 'none'}"),
         ("success", f"{result.success_rate:.3f}", f"{interval(result.success_interval)} Wilson 95 %"),
+        ("max reward", f"{result.max_reward:.3f}", f"{interval(result.max_reward_interval)} bootstrap 95 %"),
         ("L1", f"{result.l1:.3f}", f"{interval(result.l1_interval)} bootstrap 95 %"),
         ("L1 floor", f"{result.l1_floor:.3f}", f"{interval(result.l1_floor_band)} perfect reproducer, 95 %"),
         ("coverage", f"{result.coverage:.3f}", "share of demonstrated behaviours shown"),

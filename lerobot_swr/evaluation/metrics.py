@@ -162,5 +162,14 @@ def style_fidelity(labels: Sequence[str], requested: Sequence[str]) -> float:
 
 def median_interval(values: Sequence[float]) -> Interval:
     """Bootstrap 95 % interval of a median."""
-    drawn = np.random.default_rng(0).choice(np.asarray(values, float), size=(BOOTSTRAP_DRAWS, len(values)))
-    return Interval(*np.quantile(np.median(drawn, axis=1), [0.025, 0.975]).tolist())
+    return Interval(*np.quantile(np.median(_resampled(values), axis=1), [0.025, 0.975]).tolist())
+
+
+def mean_interval(values: Sequence[float]) -> Interval:
+    """Bootstrap 95 % interval of a mean."""
+    return Interval(*np.quantile(_resampled(values).mean(axis=1), [0.025, 0.975]).tolist())
+
+
+def _resampled(values: Sequence[float]) -> np.ndarray:
+    """(draws, n) values, n at a time with replacement."""
+    return np.random.default_rng(0).choice(np.asarray(values, float), size=(BOOTSTRAP_DRAWS, len(values)))

@@ -25,6 +25,7 @@ class Rollout:
         behavior: Label that the rule gave.
         success: Whether the environment called it a success.
         length: T, number of actions.
+        max_reward: The largest reward of an action.
         style_episode: The demonstration whose style was used; None for a policy without styles or a blend.
     """
 
@@ -32,6 +33,7 @@ class Rollout:
     behavior: str
     success: bool
     length: int
+    max_reward: float
     style_episode: int | None
 
 
@@ -127,6 +129,7 @@ def run_rollouts(
             length = int(outcome["done"][i].int().argmax()) + 1
             states = {key: value[: length + 1] for key, value in observations.items()}
             success = bool(outcome["success"][i, :length].any())
+            max_reward = float(outcome["reward"][i, :length].max())
             style = None if styles[i] in (None, BLENDED) else styles[i]
-            rollouts.append(Rollout(states, rule(states), success, length, style))
+            rollouts.append(Rollout(states, rule(states), success, length, max_reward, style))
     return rollouts
