@@ -19,6 +19,7 @@ __version__ = "0.1.0"
 
 import lerobot_swr.envs.d3il.configuration_d3il
 import lerobot_swr.envs.maze2d.configuration_maze2d
+import lerobot_swr.envs.pusht.task
 import lerobot_swr.policies.baselines.configuration_baselines
 import lerobot_swr.policies.configuration_swr
 import lerobot_swr.policies.processor_swr  # noqa: F401

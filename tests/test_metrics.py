@@ -15,6 +15,7 @@ from lerobot_swr.evaluation.metrics import (
     l1_distance,
     l1_floor,
     l1_interval,
+    mean_interval,
     style_fidelity,
     success_entropy,
     success_interval,
@@ -78,6 +79,15 @@ def test_wilsons_interval_matches_its_formula():
     interval = success_interval([True] * 95 + [False] * 5)
     assert interval.low == pytest.approx((centre - spread) / (1 + z**2 / n), abs=1e-5)
     assert interval.high == pytest.approx((centre + spread) / (1 + z**2 / n), abs=1e-5)
+
+
+def test_the_interval_of_a_mean_is_the_normal_one_for_many_values():
+    """± 1.96 standard errors for 400 values."""
+    values = np.random.default_rng(0).exponential(size=400)
+    interval = mean_interval(values.tolist())
+    error = 1.96 * values.std() / 20
+    assert interval.low == pytest.approx(values.mean() - error, abs=0.2 * error)
+    assert interval.high == pytest.approx(values.mean() + error, abs=0.2 * error)
 
 
 def test_the_bootstrap_interval_narrows_with_rollouts_and_widens_with_differing_seeds():

@@ -2,4 +2,5 @@
 
 * `block`: the T-shaped block: its pose, its cover of the goal and its sides, from its keypoints.
 * `behavior`: which behaviour an episode shows (needs no simulator).
+* `task`: what evaluations ask of the environment.
 """
