@@ -90,6 +90,37 @@ def test_the_same_seed_gives_the_same_rollouts(run_command, trained_zbc, small_m
     assert first["episodes"] != other["episodes"]
 
 
+def test_rollouts_begin_where_demonstrations_did(
+    run_command, make_tiny_policy, small_maze, small_maze_meta, tmp_path, monkeypatch
+):
+    """One after the other, and again from the first, over batches; with their styles if these are fixed."""
+    shown = []
+    monkeypatch.setattr(
+        eval_command, "plot_behaviors", lambda path, _, rollouts, *rest: shown.extend(rollouts)
+    )
+    policy = make_tiny_policy("bc")
+    checkpoint = save_checkpoint(policy, small_maze_meta, tmp_path / "policy")
+    flags = (*ENV, "--env.start=random", "--recorded_starts=true", "--n_episodes=8", "--batch_size=5")
+    evaluate(run_command, checkpoint, small_maze, tmp_path, *flags)
+    starts = [
+        e["observation.state"][0]
+        for e in load_trajectories(small_maze_meta, ["observation.state"]).episodes()
+    ]
+    for k, (path, _) in enumerate(shown):
+        np.testing.assert_allclose(path[0], starts[k % 6], atol=1e-6)
+    assert len(shown) == 8
+
+
+def test_recorded_starts_are_refused_where_starts_are_chosen_otherwise(
+    run_command, trained_zbc, small_maze, tmp_path, capsys
+):
+    """Perturbed starts are not the recorded ones."""
+    flags = (*ENV, "--recorded_starts=true", "--robustness=true")
+    with pytest.raises(SystemExit):
+        evaluate(run_command, trained_zbc, small_maze, tmp_path, *flags)
+    assert "--recorded_starts and --robustness exclude each other" in capsys.readouterr().err
+
+
 def test_lerobot_eval_runs_the_same_checkpoint(trained_zbc, tmp_path, monkeypatch):
     """LeRobot's own command, with videos."""
     flags = ["--eval.n_episodes=2", "--eval.batch_size=1", f"--output_dir={tmp_path}", *ENV]

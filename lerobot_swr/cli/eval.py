@@ -101,6 +101,7 @@ def evaluate(cfg: EvalCommand) -> None:
         batch_size=cfg.batch_size,
         seed=cfg.seed,
         reference_episodes=cfg.dataset.episodes,
+        recorded_starts=cfg.recorded_starts,
     )
     result = comparison.result
     write_json(cfg.output_dir / "behaviors.json", result, _provenance(cfg))

@@ -14,6 +14,7 @@ CONFLICTS = {
     ),
     "blend": ("length_band", "n_episodes", "style_sampling", "policy.style_sampling", "dataset.episodes"),
     "length_band": ("dataset.episodes",),
+    "recorded_starts": ("robustness", "counterfactual", "blend"),
     "style_sampling": ("policy.style_sampling",),
     "baseline": ("rename_map", "policy.*"),
     "baseline=replay": (
@@ -23,11 +24,12 @@ CONFLICTS = {
         "length_band",
         "n_episodes",
         "style_sampling",
+        "recorded_starts",
     ),
 }
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),
-    *("style_sampling", "behavior_rule", "n_episodes", "batch_size"),
+    *("style_sampling", "behavior_rule", "n_episodes", "batch_size", "recorded_starts"),
     *("policy.style_sampling", "policy.style_interpolate"),
 )
 

@@ -34,6 +34,9 @@ class EvalCommand:
     # How styles are drawn: uniform (the paper), stratified (each style once before any again) or fixed; null
     # keeps the checkpoint's setting.
     style_sampling: str | None = None
+    # Begin rollout k where the k-th demonstration (of dataset.episodes) began, not where the environment
+    # draws; with style_sampling fixed it has that demonstration's style, too.
+    recorded_starts: bool = False
     # Request every demonstrated behaviour from this many starts, the same for all, instead of n_episodes
     # rollouts: confusion matrix, control accuracy, distance to the requested demonstrations. 0 does not.
     counterfactual: int = 0
@@ -62,6 +65,8 @@ class EvalCommand:
         if self.style_sampling is not None:
             check_style_sampling(self.style_sampling)
         self._refuse_conflicts()
+        if self.recorded_starts and self.env is not None:
+            task_of(self.env).start_rule()  # refuses environments that have none
         self._find_policy()
         if self.length_band is not None and len(self.length_band) != 2:
             raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
@@ -81,6 +86,7 @@ class EvalCommand:
             "counterfactual": self.counterfactual > 0,
             "blend": self.blend > 0,
             "length_band": self.length_band is not None,
+            "recorded_starts": self.recorded_starts,
             "style_sampling": self.style_sampling is not None,
             "behavior_rule": self.behavior_rule is not None,
             "n_episodes": self._is_given("n_episodes"),

@@ -184,6 +184,7 @@ def compare(
     batch_size: int = 100,
     seed: int = 1000,
     reference_episodes: Sequence[int] | None = None,
+    recorded_starts: bool = False,
 ) -> Comparison:
     """Roll a policy out and compare it with its demonstrations.
 
@@ -196,15 +197,24 @@ def compare(
         batch_size: Largest number of environments that run at once.
         seed: Seeds the drawing of styles and the environments.
         reference_episodes: The demonstrations to compare with; None takes all.
+        recorded_starts: Begin where these demonstrations did, one after the other and again from the first,
+            instead of where the environment draws.
+
+    Raises:
+        MissingRuleError: If the environment cannot be put into a recorded start.
     """
     task = task_of(env_cfg)
+    chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
+    starts = None
+    if recorded_starts:
+        start_of = task.start_rule()
+        starts = [start_of(trajectories.episode(chosen[k % len(chosen)])) for k in range(n_episodes)]
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
-    rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed)
+    rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed, starts=starts)
     sampling, drawn = None, None
     if checkpoint.has_styles:
         sampling = checkpoint.policy.config.style_sampling
         drawn = allowed_episodes(checkpoint, len(demonstrated))
-    chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
     return Comparison(
         evaluate_behaviors(
             rollouts,

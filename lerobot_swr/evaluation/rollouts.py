@@ -1,6 +1,6 @@
 """Rollouts of any LeRobot policy, with the states that behaviour rules need."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,6 +78,28 @@ class StateRecorder(gym.vector.VectorWrapper):
         return [{key: value[i] for key, value in low_dimensional.items()} for i in range(self.num_envs)]
 
 
+class StartedRecorder(StateRecorder):
+    """Lets every sub-environment begin in a given state.
+
+    Args:
+        env: A vector environment that resets single sub-environments (Gymnasium's ``reset_mask``).
+        starts: Options of `reset` for each sub-environment, see `Task.start_rule`.
+    """
+
+    def __init__(self, env: gym.vector.VectorEnv, starts: Sequence[Mapping[str, Any]]):
+        super().__init__(env)
+        self._starts = starts
+
+    def reset(self, **kwargs: Any) -> tuple[dict, dict]:  # type: ignore[override]
+        """Reset all sub-environments, each into its start, and begin recording."""
+        observations, info = super().reset(**kwargs)
+        for i, start in enumerate(self._starts):
+            mask = np.arange(self.num_envs) == i
+            options = {**(kwargs.get("options") or {}), **start, "reset_mask": mask}
+            observations, info = super().reset(**{**kwargs, "options": options})
+        return observations, info
+
+
 def _low_dimensional(observations: dict) -> dict[str, np.ndarray]:
     return {k: np.array(v) for k, v in observations.items() if k != "pixels" and isinstance(v, np.ndarray)}
 
@@ -90,6 +112,7 @@ def run_rollouts(
     batch_size: int,
     seed: int,
     env_seeds: Sequence[int] | None = None,
+    starts: Sequence[Mapping[str, Any]] | None = None,
 ) -> list[Rollout]:
     """Roll a policy out and label its behaviours.
 
@@ -101,6 +124,7 @@ def run_rollouts(
         batch_size: Largest number of environments that run at once.
         seed: Seeds torch once and environment k with ``seed + k``.
         env_seeds: Seeds of the environments, one per episode, instead.
+        starts: Options of `reset` for recorded starts, one per episode; None lets the environment draw.
     """
     env_seeds = range(seed, seed + n_episodes) if env_seeds is None else env_seeds
     set_seed(seed)
@@ -110,7 +134,9 @@ def run_rollouts(
     rollouts: list[Rollout] = []
     while len(rollouts) < n_episodes:
         size = min(batch_size, n_episodes - len(rollouts))
-        env = StateRecorder(task_of(env_cfg).create_rollout_env(size))
+        batch = slice(len(rollouts), len(rollouts) + size)
+        env = task_of(env_cfg).create_rollout_env(size)
+        env = StateRecorder(env) if starts is None else StartedRecorder(env, starts[batch])
         try:
             outcome = rollout(
                 env,
@@ -119,7 +145,7 @@ def run_rollouts(
                 env_postprocessor,
                 checkpoint.preprocessor,
                 checkpoint.postprocessor,
-                seeds=list(env_seeds[len(rollouts) : len(rollouts) + size]),
+                seeds=list(env_seeds[batch]),
             )
             episodes = env.episodes()
         finally:
