@@ -9,7 +9,7 @@ def main() -> None:
     """Run the benchmarks in the order of their names."""
     for path in sorted(Path(__file__).parent.glob("bench_*.py")):
         print(f"\n=== {path.stem} ===", flush=True)
-        subprocess.run([sys.executable, str(path)], check=True)
+        subprocess.run([sys.executable, "-m", f"benchmarks.{path.stem}"], check=True)
 
 
 if __name__ == "__main__":

@@ -59,7 +59,7 @@ def largest_parts(root: Path) -> dict[str, float]:
     policy = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/only_forward", root=root))
     seeds = COUNTS_OF_SEEDS[0]
     layers = []  # inputs (seeds, batch, in), weights (seeds, in, out), gradients of outputs
-    for weight in policy.network.parameters():
+    for weight in policy.backbone.parameters():
         if weight.dim() == 2:
             out, size = weight.shape
             shapes = ((seeds, BATCH_SIZE, size), (seeds, size, out), (seeds, BATCH_SIZE, out))

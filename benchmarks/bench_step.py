@@ -45,8 +45,6 @@ def main() -> None:
     frames = torch.repeat_interleave(
         torch.arange(100), torch.from_numpy(policies["zbc"].trajectories.lengths)
     )
-    for policy in policies.values():
-        policy.styles.mark_trained(torch.arange(100))
     compare("bare step", {name: bare_step(policy) for name, policy in policies.items()}, frames)
     compare(
         "step of lerobot-train", {name: lerobot_step(policy) for name, policy in policies.items()}, frames

@@ -38,7 +38,8 @@ def one_line(error: BaseException) -> str:
 
 def _is_full_disk(error: BaseException) -> bool:
     number = error.errno if isinstance(error, OSError) else None
-    return number in FULL_DISK or (isinstance(error, SafetensorError) and "os error 28" in str(error))
+    told = isinstance(error, SafetensorError) and any(f"os error {n})" in str(error) for n in FULL_DISK)
+    return number in FULL_DISK or told
 
 
 def _flat(error: BaseException) -> str:

@@ -5,14 +5,23 @@ from typing import Literal
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from lerobot_swr.similarity import Normalization, check_beta, check_normalization
+from lerobot_swr.similarity import (
+    Dissimilarity,
+    Normalization,
+    Similarity,
+    check_beta,
+    check_normalization,
+    similarity_weights,
+)
 
 PartnerSampling = Literal["uniform", "weighted"]
 
+PARTNERS = 256  # nearest others that are drawn by their share; the rest are drawn uniformly
 MAX_INSPECTED_STYLES = 64
-NUMBERS_PER_BLOCK = 2**14  # random numbers that are drawn together: many cost little more than a few
+LARGEST_FACTOR = 16.0  # by which a frame of the rest may weigh more than others
+ROWS = 4096  # episodes whose shares are computed at once
 
 
 @dataclass(frozen=True)
@@ -20,17 +29,17 @@ class Pairs:
     """Which style each frame of a batch teaches, and how much.
 
     Attributes:
-        styles: (B,) int64, episode j whose style is used; j = i where the frame is not relabelled.
+        episodes: (B,) int64, episode j whose style is used; j = i where the frame is not relabelled.
         weights: (B,) weight of the frame's loss.
         relabelled: (B,) bool, True where j ≠ i: no gradient may flow into z_j there.
     """
 
-    styles: Tensor
+    episodes: Tensor
     weights: Tensor
     relabelled: Tensor
 
 
-class SimilarityWeightedSampler:
+class PartnerSampler:
     """Draws pairs (i, j) for given episodes i, so that on average a style j learns as algorithm 1 has it.
 
     ``uniform`` is the paper's way: j ≠ i uniformly at probability p, weighted by W(τ_i, τ_j), else j = i.
@@ -38,15 +47,24 @@ class SimilarityWeightedSampler:
     ``weighted`` draws the pair by its share in the same expectation, 1 - p for j = i and p W(τ_i, τ_j) / (M
     - 1) for each of the M - 1 others, and weights every frame by the sum of these shares: no frame is wasted.
 
-    Only *candidates* are drawn: episodes that take part in training; there are none until `set_candidates`.
-    The normalization of ν, too, is over the candidates. ν and W are computed for the drawn pairs alone.
+    That holds for i itself and its nearest partners, whose shares are held. The rest of the M candidates has
+    one share in common, of which its members are drawn uniformly and weighted by W over what the share takes
+    W for: about its root mean square, with which the weights vary least. So the expectation is the same, and
+    memory and the work of a step do not grow with M beyond M times the number of partners.
 
     Args:
-        distances: (N, N) distances of the episodes.
+        similarity: Of N demonstrations.
+        candidates: (M,) sorted episodes, those that take part in training: only they are drawn, and over them
+            ν is normalised.
         beta: Inverse temperature of the weights, >= 0.
         p: Probability of relabelling a frame.
         normalization: How distances become dissimilarities, ``row`` or ``global``.
         partner_sampling: ``uniform`` or ``weighted``.
+        partners: How many nearest others ``weighted`` draws by their shares.
+
+    Attributes:
+        effective_demos: Kish's effective number of demonstrations that teach a style, from 1 (its own alone)
+            to M: (Σ_i W_ij)² / Σ_i W_ij², averaged over styles j; over some of them where there are many.
 
     Raises:
         ValueError: For a value out of range.
@@ -54,54 +72,73 @@ class SimilarityWeightedSampler:
 
     def __init__(
         self,
-        distances: np.ndarray,
+        similarity: Similarity,
+        candidates: np.ndarray,
         beta: float,
         p: float,
         normalization: Normalization = "row",
-        partner_sampling: PartnerSampling = "uniform",
+        partner_sampling: PartnerSampling = "weighted",
+        partners: int = PARTNERS,
     ):
         check_beta(beta)
         check_probability(p)
         check_partner_sampling(partner_sampling)
         check_normalization(normalization)
-        self.beta, self.p = beta, p
-        self.normalization, self.partner_sampling = normalization, partner_sampling
-        self._distances = distances
-        self._candidates = b""  # what `set_candidates` was given; equal bytes are the quickest comparison
-        self._marked = np.zeros(len(distances), dtype=bool)
-        self._candidate_list = np.flatnonzero(self._marked)
-        self._row_largest = np.zeros(len(distances))  # (N,) largest distance to a candidate
-        self._largest = self._row_largest  # (N,) what a row of distances is divided by
-        self._effective_demos: float | None = None
+        self.beta, self.p, self.partner_sampling = beta, p, partner_sampling
+        self._candidates, count = candidates, len(candidates)
+        self._place = np.full(len(similarity), -1)  # (N,) of an episode among the candidates
+        self._place[candidates] = np.arange(count)
+        self._dissimilarity = Dissimilarity(similarity, candidates, normalization)
+        drawn = np.random.default_rng(0).permutation(count)[:MAX_INSPECTED_STYLES]
+        inspected = self._weights_of(candidates[np.sort(drawn)])
+        self.effective_demos = float((inspected.sum(axis=0) ** 2 / (inspected**2).sum(axis=0)).mean())
+        self._n_rest = 0
+        if partner_sampling == "weighted" and p > 0 and count > 1:
+            near, distances = similarity.nearest(candidates, partners, candidates)
+            self._hold_shares(near, distances, inspected)
 
-    def set_candidates(self, candidates: Tensor) -> None:
-        """Restrict the draw to the episodes marked in `candidates`, (N,), non-zero where marked."""
-        given = candidates.cpu().numpy()
-        content = given.tobytes()
-        if content == self._candidates:
-            return
-        known, marked = self._marked, given != 0
-        self._candidates, self._marked = content, marked
-        self._candidate_list = np.flatnonzero(marked)  # (M,)
-        self._place = marked.cumsum() - 1  # (N,) place of a candidate in that list
-        if (known & ~marked).any():
-            known, self._row_largest = np.zeros_like(known), np.zeros(len(known))
-        joined = np.flatnonzero(marked & ~known)  # few at a time, while episodes are seen for the first time
-        self._row_largest = np.maximum(self._row_largest, self._distances[:, joined].max(axis=1, initial=0))
-        self._largest = self._row_largest
-        if self.normalization == "global":
-            self._largest = np.full(len(marked), self._row_largest[self._candidate_list].max())
-        # Shares of the pairs, cumulative over partners: rows are filled when they are needed.
-        self._shares = np.empty((len(marked), len(self._candidate_list)))  # (N, M)
-        self._mass = np.empty(len(marked))  # (N,) their sum
-        self._has_shares = np.zeros(len(marked), dtype=bool)
-        self._all_filled = False
-        self._effective_demos = None
+    def _weights_of(self, styles: np.ndarray) -> np.ndarray:
+        """(M, S) float32 W(τ_i, τ_j) of all candidates i and some styles j."""
+        weights = np.empty((len(self._candidates), len(styles)), dtype=np.float32)
+        for start in range(0, len(weights), ROWS):
+            rows = self._candidates[start : start + ROWS, None]
+            weights[start : start + ROWS] = similarity_weights(
+                self._dissimilarity.nu(rows, styles), self.beta
+            )
+        return weights
+
+    def _hold_shares(self, near: np.ndarray, distances: np.ndarray, inspected: np.ndarray) -> None:
+        """Prepare ``weighted``.
+
+        Args:
+            near: (M, K) nearest other candidates.
+            distances: (M, K) their distances.
+            inspected: (M, S) weights of every candidate and some styles, which stand for the rest.
+        """
+        count, partners = near.shape
+        self._n_rest = count - 1 - partners
+        # By place, so that the rest can be counted through: itself and its partners, then the rest.
+        self._known = np.empty((count, partners + 1), dtype=np.int32)
+        self._shares = np.empty((count, partners + 2))  # cumulative
+        self._typical = np.zeros(count)  # W that the rest's share takes
+        for start in range(0, count, ROWS):
+            rows = slice(start, min(start + ROWS, count))
+            own = self._candidates[rows, None]
+            weights = similarity_weights(self._dissimilarity.of_distances(own, distances[rows]), self.beta)
+            if self._n_rest:
+                self._typical[rows] = _typical_weight(weights[:, -1], inspected[rows])
+            known = np.column_stack([np.arange(count)[rows], self._place[near[rows]]])
+            others = self.p / (count - 1)
+            shares = np.column_stack([np.full(len(weights), 1 - self.p), others * weights])
+            order = known.argsort(axis=1)
+            self._known[rows] = np.take_along_axis(known, order, axis=1)
+            shares = np.take_along_axis(shares, order, axis=1)
+            rest = others * self._n_rest * self._typical[rows]
+            self._shares[rows] = np.column_stack([shares, rest]).cumsum(axis=1)
 
     def nu(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """ν(τ_i, τ_j) of pairs of episodes, (B,) each or broadcastable to each other."""
-        largest = self._largest[i]
-        return np.divide(self._distances[i, j], largest, where=largest > 0, out=np.zeros(np.shape(i * j)))
+        """ν(τ_i, τ_j) of pairs of episodes, of equal shapes or broadcast to each other."""
+        return self._dissimilarity.nu(i, j)
 
     def draw(self, episodes: Tensor, uniforms: np.ndarray) -> Pairs:
         """Draw a partner for every frame.
@@ -109,127 +146,74 @@ class SimilarityWeightedSampler:
         Args:
             episodes: (B,) int64, episode i of each frame; all of them candidates.
             uniforms: (B,) independent numbers, uniform in [0, 1); each decides one frame's partner.
+
+        Raises:
+            ValueError: If an episode is no candidate.
         """
         # NumPy: on a CPU, torch's overhead for so few numbers would be noticeable in every step.
-        own = episodes.cpu().numpy()
-        if self.p == 0 or len(self._candidate_list) < 2:
-            styles, weights, relabelled = own, np.ones(len(own)), np.zeros(len(own), dtype=bool)
+        own = self._place[episodes.cpu().numpy()]
+        if (own < 0).any():
+            known = np.unique(episodes.cpu().numpy()[own < 0]).tolist()
+            raise ValueError(
+                f"episodes {known} are not among the {len(self._candidates)} that are trained on"
+            )
+        if self.p == 0 or len(self._candidates) < 2:
+            partner, weights = own, np.ones(len(own))
         elif self.partner_sampling == "uniform":
-            styles, weights, relabelled = self._draw_uniform(own, uniforms)
+            partner, weights = self._draw_uniform(own, uniforms)
         else:
-            styles, weights, relabelled = self._draw_weighted(own, uniforms)
+            partner, weights = self._draw_weighted(own, uniforms)
         device = episodes.device
         return Pairs(
-            torch.from_numpy(styles).to(device),
+            torch.from_numpy(self._candidates[partner]).to(device),
             torch.from_numpy(weights.astype(np.float32)).to(device),
-            torch.from_numpy(relabelled).to(device),
+            torch.from_numpy(partner != own).to(device),
         )
 
-    def _draw_uniform(
-        self, own: np.ndarray, numbers: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        others = len(self._candidate_list) - 1
-        relabelled = numbers < self.p
+    def _draw_uniform(self, own: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) partners j and weights W, of (B,) places."""
+        others = len(self._candidates) - 1
         place = np.minimum((numbers * (others / self.p)).astype(np.int64), others - 1)
-        place += place >= self._place[own]  # skips the frame's own episode
-        styles = np.where(relabelled, self._candidate_list[place], own)
-        return styles, np.exp(-self.beta * self.nu(own, styles)), relabelled
+        place += place >= own  # skips the frame's own episode
+        partner = np.where(numbers < self.p, place, own)
+        return partner, self._weight(own, partner)
 
-    def _draw_weighted(
-        self, own: np.ndarray, numbers: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        if not self._all_filled:
-            self._fill_shares(own)
-        mass = self._mass[own]
+    def _draw_weighted(self, own: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) partners j and weights, of (B,) places."""
+        shares = self._shares[own]  # (B, K + 2)
+        weights, last = shares[:, -1], self._known.shape[1] - 1
+        numbers = numbers * weights
         # Inverse distribution function: how many cumulative shares lie at or below the number.
-        place = (self._shares[own] <= (numbers * mass)[:, None]).sum(axis=1)
-        styles = self._candidate_list.take(place, mode="clip")
-        return styles, mass, styles != own
+        slot = (shares <= numbers[:, None]).sum(axis=1)
+        partner = self._known[own, np.minimum(slot, last)].astype(np.int64)
+        (rest,) = np.nonzero((slot > last) & (self._typical[own] > 0))
+        if len(rest):
+            whose, known = own[rest], self._known[own[rest]]
+            beyond = shares[rest, -1] - shares[rest, -2]
+            count = ((numbers[rest] - shares[rest, -2]) / beyond * self._n_rest).astype(np.int64)
+            count = np.minimum(count, self._n_rest - 1)
+            # The count-th place that is not among the known ones, which are sorted.
+            skipped = (known - np.arange(last + 1) <= count[:, None]).sum(axis=1)
+            partner[rest] = count + skipped
+            weights = weights.copy()
+            weights[rest] *= self._weight(whose, partner[rest]) / self._typical[whose]
+        return partner, weights
 
-    def _fill_shares(self, episodes: np.ndarray) -> None:
-        """Pairs (i, j) of `episodes`: 1 - p for j = i, p W(i, j) / (M - 1) for j ≠ i, summed up over j."""
-        episodes = np.unique(episodes[~self._has_shares[episodes]])
-        others = len(self._candidate_list) - 1
-        shares = np.exp(-self.beta * self.nu(episodes[:, None], self._candidate_list)) * (self.p / others)
-        shares[np.arange(len(episodes)), self._place[episodes]] = 1 - self.p
-        self._shares[episodes] = shares.cumsum(axis=1)
-        self._mass[episodes] = self._shares[episodes, -1]
-        self._has_shares[episodes] = True
-        self._all_filled = bool(self._has_shares[self._candidate_list].all())
-
-    @property
-    def effective_demos(self) -> float:
-        """Kish's effective number of demonstrations that teach a style, from 1 (its own alone) to M.
-
-        (Σ_i W_ij)² / Σ_i W_ij², averaged over styles j; over an even selection of them where there are many.
-        """
-        if self._effective_demos is None:
-            self._effective_demos = self._count_effective_demos()
-        return self._effective_demos
-
-    def _count_effective_demos(self) -> float:
-        stride = -(-len(self._candidate_list) // MAX_INSPECTED_STYLES)
-        styles = self._candidate_list[::stride]
-        weights = np.exp(-self.beta * self.nu(self._candidate_list[:, None], styles))  # (M, styles)
-        return float((weights.sum(axis=0) ** 2 / (weights**2).sum(axis=0)).mean())
+    def _weight(self, i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        """W(τ_i, τ_j) of pairs of places."""
+        return similarity_weights(self._dissimilarity.nu(self._candidates[i], self._candidates[j]), self.beta)
 
 
-class StepGenerator(nn.Module):
-    """Random numbers of every training step, a pure function of seed, process and step.
-
-    Seed and step are buffers, so they travel with a checkpoint and a resumed run draws what the uninterrupted
-    one would have drawn. (Torch's global generator, although LeRobot restores it, does not give that: making
-    a data loader's iterator draws from it, once more in a resumed run than in one that goes on.)
+def _typical_weight(nearest: np.ndarray, inspected: np.ndarray) -> np.ndarray:
+    """(M,) about the root mean square of the rest's weights, and no less than bounds a frame's weight.
 
     Args:
-        stream: Generators of different streams are independent of each other.
+        nearest: (M,) weights of the farthest partner, above which none of the rest's lies.
+        inspected: (M, S) weights of some styles, not all of which belong to the rest.
     """
-
-    def __init__(self, stream: int = 0) -> None:
-        super().__init__()
-        self._stream = stream
-        self._drawn: tuple[tuple[int, ...], np.ndarray] | None = None  # the last block
-        self.seed: Tensor
-        self.step: Tensor
-        self.register_buffer("seed", torch.tensor(torch.initial_seed() % 2**63))
-        self.register_buffer("step", torch.tensor(0))
-
-    def next(self) -> torch.Generator:
-        """A generator for the next step, on the CPU."""
-        entropy = self._entropy(int(self.step))
-        self.step.add_(1)
-        seed = np.random.SeedSequence(entropy).generate_state(1, np.uint32)[0]
-        return torch.Generator().manual_seed(int(seed))
-
-    def uniforms(self, steps: int, count: int) -> np.ndarray:
-        """(steps * count,) float64 numbers in [0, 1), `count` for each of the next steps."""
-        first = int(self.step)
-        self.step.add_(steps)
-        return self.uniforms_at(first, steps, count)
-
-    def uniforms_at(self, first: int, steps: int, count: int) -> np.ndarray:
-        """The numbers of `uniforms` for steps `first` to `first` + `steps` - 1, whichever is the next one."""
-        per_block = max(1, NUMBERS_PER_BLOCK // count)  # steps
-        parts = []
-        while steps > 0:
-            block, place = divmod(first, per_block)
-            parts.append(self._block(block, per_block, count)[place : place + steps])
-            first, steps = first + len(parts[-1]), steps - len(parts[-1])
-        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(-1)
-
-    def _block(self, block: int, steps: int, count: int) -> np.ndarray:
-        """(steps, count) numbers of consecutive steps."""
-        entropy = (*self._entropy(block), count)
-        if self._drawn is None or self._drawn[0] != entropy:
-            numbers = np.random.default_rng(entropy).random((steps, count))
-            # A little below 1, lest a product with such a number be rounded up to its other factor.
-            self._drawn = (entropy, np.minimum(numbers, 1 - 1e-9))
-        return self._drawn[1]
-
-    def _entropy(self, place: int) -> tuple[int, ...]:
-        distributed = torch.distributed.is_available() and torch.distributed.is_initialized()
-        process = torch.distributed.get_rank() if distributed else 0
-        return int(self.seed), process, place, self._stream
+    of_rest = inspected <= (1 + 1e-5) * nearest[:, None]
+    squares = (inspected**2 * of_rest).sum(axis=1) / np.maximum(of_rest.sum(axis=1), 1)
+    return np.maximum(np.sqrt(squares), nearest / LARGEST_FACTOR)
 
 
 def check_probability(p: float) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class Trajectories:
         """Number of episodes."""
         return len(self.lengths)
 
-    @property
+    @cached_property
     def starts(self) -> np.ndarray:
         """(N,) int64, row at which each episode starts."""
         return np.cumsum(self.lengths) - self.lengths
@@ -53,10 +54,14 @@ class Trajectories:
         """All episodes in order, as `episode` gives them."""
         return (self.episode(i) for i in range(len(self)))
 
+    def joined(self, keys: Sequence[str]) -> np.ndarray:
+        """The features `keys` of every frame side by side: (sum of lengths, d) float32; of one, no copy."""
+        columns = [self.columns[key] for key in keys]
+        return columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1)
+
     def states(self, keys: Sequence[str]) -> list[np.ndarray]:
         """The features `keys` of every episode side by side: N arrays (T_i, d)."""
-        joined = np.concatenate([self.columns[key] for key in keys], axis=1)
-        return np.split(joined, self.starts[1:])
+        return np.split(self.joined(keys), self.starts[1:])
 
     def subset(self, episodes: Sequence[int]) -> "Trajectories":
         """Some of the episodes, in the given order."""
@@ -77,6 +82,11 @@ class Trajectories:
         columns = {key: column[~left_out] for key, column in self.columns.items()}
         return replace(self, lengths=lengths, columns=columns, index=None)
 
+    def followed_by(self, other: "Trajectories", keys: Sequence[str]) -> "Trajectories":
+        """The features `keys` of these episodes and of others after them."""
+        columns = {key: np.concatenate([self.columns[key], other.columns[key]]) for key in keys}
+        return Trajectories(np.concatenate([self.lengths, other.lengths]), columns, self.fps, self.name)
+
     def rows_of(self, episodes: np.ndarray) -> np.ndarray:
         """(F,) rows of frames of which only the (F,) `episodes` are known, each episode's in order.
 
@@ -91,10 +101,10 @@ class Trajectories:
 
     def fingerprint(self, keys: Sequence[str]) -> str:
         """Hash of the content of the features `keys` and of the episodes' lengths, in hexadecimal."""
-        digest = hashlib.sha256(np.ascontiguousarray(self.lengths).tobytes())
+        digest = hashlib.sha256(np.ascontiguousarray(self.lengths))
         for key in keys:
             digest.update(f"{key}{self.columns[key].shape}".encode())
-            digest.update(np.ascontiguousarray(self.columns[key]).tobytes())
+            digest.update(np.ascontiguousarray(self.columns[key]))
         return digest.hexdigest()[:32]
 
 

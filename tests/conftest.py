@@ -10,6 +10,7 @@ os.environ["HF_HUB_OFFLINE"] = "1"
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
 from lerobot.policies.factory import make_policy_config
@@ -18,6 +19,8 @@ from lerobot.scripts import lerobot_train
 import lerobot_swr  # noqa: F401  (registers policies and environments)
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
+from lerobot_swr.run_context import running
 
 # A busy machine fails no test.
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,12 +54,18 @@ def small_maze_meta(small_maze: Path) -> LeRobotDatasetMetadata:
 
 @pytest.fixture
 def make_tiny_policy(small_maze_meta: LeRobotDatasetMetadata) -> Callable[..., PreTrainedPolicy]:
-    """Builds a small policy on `small_maze` through LeRobot's factory, the same for the same seed."""
+    """Builds a small policy on `small_maze` through LeRobot's factory, the same for the same seed.
 
-    def make(policy_type: str, seed: int = 0, **options) -> PreTrainedPolicy:
+    It is made to train on `episodes`; None takes all.
+    """
+
+    def make(
+        policy_type: str, seed: int = 0, episodes: list[int] | None = None, **options
+    ) -> PreTrainedPolicy:
         torch.manual_seed(seed)
-        options = {"hidden_dim": 16, "num_hidden": 3, "device": "cpu", "push_to_hub": False, **options}
-        return make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
+        options = {"backbone": MLPConfig(16, 3), "device": "cpu", "push_to_hub": False, **options}
+        with running(DatasetConfig("local/small_maze", episodes=episodes)):
+            return make_policy(make_policy_config(policy_type, **options), ds_meta=small_maze_meta)
 
     return make
 

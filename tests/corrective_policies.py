@@ -11,6 +11,7 @@ from lerobot.policies.factory import make_policy_config
 
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 
 STATE, ENV, ACTION = "observation.state", "observation.environment_state", "action"
 LAG = 4
@@ -43,7 +44,7 @@ def servo_dataset(tmp_path_factory) -> Path:
 def make(root: Path, policy_type: str = "zbc", **options):
     """A small policy on a dataset, in training mode."""
     torch.manual_seed(0)
-    options = {"hidden_dim": 16, "num_hidden": 3, "device": "cpu", "push_to_hub": False, **options}
+    options = {"backbone": MLPConfig(16, 3), "device": "cpu", "push_to_hub": False, **options}
     meta = LeRobotDatasetMetadata(f"local/{root.name}", root=root)
     return make_policy(make_policy_config(policy_type, **options), ds_meta=meta).train(), meta
 

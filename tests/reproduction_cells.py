@@ -31,7 +31,11 @@ def demos(small_maze, store) -> Demonstrations:
 def settings(tmp_path) -> ReproductionSettings:
     """Two seeds, twelve rollouts."""
     return ReproductionSettings(
-        steps=20, seeds=2, n_rollouts=12, policy_options={"hidden_dim": 16}, output_dir=tmp_path / "store"
+        steps=20,
+        seeds=2,
+        n_rollouts=12,
+        policy_options={"backbone.hidden_dim": 16},
+        output_dir=tmp_path / "store",
     )
 
 

@@ -16,7 +16,7 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.evaluation.checkpoint import load_checkpoint
 
-SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2")
+SMALL = ("--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2")
 
 
 # --- Refusals ---
@@ -104,6 +104,6 @@ def test_a_plain_checkpoint_is_fine_tuned_with_corrective_labels(lerobot_train_c
         *flags, f"--policy.path={checkpoint}", "--policy.corrective=noise", "--policy.optimizer_lr=1e-9"
     )
     before, after = tensors(plain, 10), tensors(tuned, 1)
-    assert "corrections.draws.seed" in after
+    assert "correct.draws.seed" in after
     for name, value in before.items():
         torch.testing.assert_close(after[name], value, atol=1e-6, rtol=0)

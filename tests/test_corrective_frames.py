@@ -9,20 +9,24 @@ import torch
 from corrective_policies import ACTION, ENV, STATE, batch_of, every_frame, make
 from lerobot.policies import make_pre_post_processors
 
+from lerobot_swr.policies.lessons import logged
+
+FEATURES = (STATE, ENV, ACTION)
+
 
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
 def test_without_corrective_labels_nothing_is_added(small_maze, policy_type):
     """The default is the paper's: no tensor, no draw and no figure more, the actions the network's."""
     policy, meta = make(small_maze, policy_type)
     assert policy.config.corrective == "none"
-    assert policy.corrections is None
-    assert not [key for key in policy.state_dict() if "corrections" in key]
+    assert policy.correct is None
+    assert not [key for key in policy.state_dict() if "correct" in key]
     batch = batch_of(policy, meta, every_frame(policy))
     drawn = policy.draw(batch)
-    assert "corrective" not in drawn
-    assert all(torch.equal(drawn[key], batch[key]) for key in (STATE, ENV, ACTION))
+    assert drawn.corrective is None
+    assert all(torch.equal(drawn.batch[key], batch[key]) for key in (STATE, ENV, ACTION))
     style = policy.styles.embedding(batch["episode_index"])
-    assert torch.equal(policy.predict(batch, style), policy.network(batch, style))
+    assert torch.equal(policy.predict(batch, style), policy.backbone(batch, style))
 
 
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
@@ -33,16 +37,17 @@ def test_half_of_the_frames_are_corrective(small_maze, policy_type, kind):
     plain, _ = make(small_maze, policy_type)
     batch = batch_of(policy, meta, every_frame(policy))
     drawn, expected = policy.draw(batch), plain.draw(batch)
-    corrective = drawn["corrective"]
+    corrective = drawn.corrective
     assert int(corrective.sum()) == len(corrective) // 2
-    for key, value in expected.items():
-        assert torch.equal(drawn[key][~corrective], value[~corrective]), key
-        assert drawn[key].dtype == value.dtype, key  # float32: not every device has float64
-    styles = drawn["style_episode"][corrective]
+    for key, value in expected.tensors(FEATURES).items():
+        found = drawn.tensors(FEATURES)[key]
+        assert torch.equal(found[~corrective], value[~corrective]), key
+        assert found.dtype == value.dtype, key  # float32: not every device has float64
+    styles = drawn.episode[corrective]
     assert set(styles.tolist()) == set(range(6))
     if policy_type == "zbc":
-        torch.testing.assert_close(drawn["weight"][corrective], policy.frame_weights(styles))
-    assert ((drawn[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
+        torch.testing.assert_close(drawn.weight[corrective], policy.balance.factors[styles])
+    assert ((drawn.batch[STATE] != batch[STATE]).any(dim=1))[corrective].float().mean() > 0.9
 
 
 def test_corrective_frames_teach_the_style_of_their_demonstration(small_maze):
@@ -52,12 +57,12 @@ def test_corrective_frames_teach_the_style_of_their_demonstration(small_maze):
     batch = batch_of(policy, meta, rows)
     drawn = policy.draw(batch)
     demonstrated = batch_of(policy, meta, rows.sort().values)
-    for place in drawn["corrective"].nonzero().squeeze(1).tolist():
-        own = demonstrated["episode_index"] == drawn["style_episode"][place]
-        distances = (demonstrated[STATE][own] - drawn[STATE][place]).norm(dim=1)
+    for place in drawn.corrective.nonzero().squeeze(1).tolist():
+        own = demonstrated["episode_index"] == drawn.episode[place]
+        distances = (demonstrated[STATE][own] - drawn.batch[STATE][place]).norm(dim=1)
         assert distances.min() < 1e-4
         torch.testing.assert_close(
-            drawn[ACTION][place], demonstrated[ACTION][own][distances.argmin()], atol=1e-3, rtol=0
+            drawn.batch[ACTION][place], demonstrated[ACTION][own][distances.argmin()], atol=1e-3, rtol=0
         )
 
 
@@ -75,8 +80,8 @@ def test_wzbc_relabels_corrective_frames_as_it_does_demonstrated_ones(small_maze
     }
     policy, meta = make(small_maze, "wzbc", **options)
     drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
-    corrective, relabelled = drawn["corrective"], drawn["corrective"] & drawn["relabelled"]
-    distances = policy.distances()
+    corrective, relabelled = drawn.corrective, drawn.corrective & ~drawn.teaches_style
+    distances = policy.data.similarity.distance(np.arange(6)[:, None], np.arange(6))
     w = np.exp(-policy.config.beta * distances / distances.max(axis=1, keepdims=True))
     np.fill_diagonal(w, 1)
     mass = 0.5 + 0.5 * (w.sum(axis=1) - 1) / (len(w) - 1)
@@ -88,14 +93,14 @@ def test_wzbc_relabels_corrective_frames_as_it_does_demonstrated_ones(small_maze
     assert float(relabelled.sum() / corrective.sum()) == pytest.approx(share, abs=0.1)
     everything = batch_of(policy, meta, every_frame(policy).sort().values)
     for place in corrective.nonzero().squeeze(1).tolist():
-        apart = (everything[STATE] - drawn[STATE][place]).norm(dim=1)
+        apart = (everything[STATE] - drawn.batch[STATE][place]).norm(dim=1)
         owners = everything["episode_index"][apart < 1e-4].unique()  # several at a shared start
-        i, j = owners.numpy(), int(drawn["style_episode"][place])
-        expected = (w[i, j] if partner_sampling == "uniform" else mass[i]) * policy.frame_weights(
+        i, j = owners.numpy(), int(drawn.episode[place])
+        expected = (w[i, j] if partner_sampling == "uniform" else mass[i]) * policy.balance.factors[
             owners
-        ).numpy()
-        assert np.isclose(float(drawn["weight"][place]), expected, rtol=1e-4).any()
-    losses, styles = policy.frame_losses(drawn), policy.styles.embedding.weight
+        ].numpy()
+        assert np.isclose(float(drawn.weight[place]), expected, rtol=1e-4).any()
+    losses, styles = policy.loss(drawn)[1], policy.styles.embedding.weight
     (gradient,) = torch.autograd.grad(losses[relabelled].sum(), styles, retain_graph=True)
     assert not gradient.any()
     (gradient,) = torch.autograd.grad(losses[corrective].sum(), styles)
@@ -107,10 +112,10 @@ def test_the_larger_half_of_odd_batches_takes_turns(small_maze):
     policy, meta = make(small_maze, corrective="noise")
     policy.draw(batch_of(policy, meta, every_frame(policy)))
     rows = torch.arange(10)
-    singly = [bool(policy.draw(batch_of(policy, meta, row[None]))["corrective"]) for row in rows]
+    singly = [bool(policy.draw(batch_of(policy, meta, row[None])).corrective) for row in rows]
     assert sum(singly) == 5
     assert singly == singly[:2] * 5
-    together = policy.draw(batch_of(policy, meta, rows), steps=10)["corrective"]
+    together = policy.draw(batch_of(policy, meta, rows), steps=10).corrective
     assert together.tolist() == singly
 
 
@@ -119,72 +124,50 @@ def test_corrective_frames_are_normalised_as_lerobot_normalises(small_maze, mode
     """Raw labels through LeRobot's own preprocessor are what the policy draws, under every normalisation."""
     mapping = dict.fromkeys(("STATE", "ENV", "ACTION"), mode)
     policy, meta = make(small_maze, corrective="noise", normalization_mapping=mapping)
-    corrections = policy.corrections
+    correct = policy.correct
     drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
-    n, per_frame = int(drawn["corrective"].sum()), corrections.labels.draws_per_frame
-    uniforms = corrections.draws.uniforms_at(0, n, per_frame).reshape(n, per_frame)
-    raw = corrections.labels.draw(uniforms, np.arange(6))
+    n, per_frame = int(drawn.corrective.sum()), correct.stream.labels.draws_per_frame
+    uniforms = correct.draws.uniforms_at(0, n, per_frame).reshape(n, per_frame)
+    raw = correct.stream.labels.draw(uniforms, np.arange(6))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     expected = {**raw.observations, ACTION: raw.actions}
     expected = preprocessor({key: torch.from_numpy(value) for key, value in expected.items()})
     for key in (STATE, ENV, ACTION):
-        torch.testing.assert_close(drawn[key][drawn["corrective"]], expected[key], atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(drawn.batch[key][drawn.corrective], expected[key], atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("size", [16, 5])
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
 def test_many_steps_drawn_at_once_are_those_drawn_one_by_one(small_maze, policy_type, size):
-    """From the first step on, when partners are still few, and later; bit for bit."""
+    """From the first step on, and later; bit for bit."""
     one, meta = make(small_maze, policy_type, corrective="demos")
     many = copy.deepcopy(one)
     rows = every_frame(one)[: 10 * size].view(10, size)
     for part in (rows[:6], rows[6:]):
         singly = [one.draw(batch_of(one, meta, step)) for step in part]
         at_once = many.draw(batch_of(many, meta, part.flatten()), len(part))
-        for key in singly[0]:
-            assert torch.equal(at_once[key], torch.cat([drawn[key] for drawn in singly])), key
+        parts = [drawn.tensors(FEATURES) for drawn in singly]
+        for key, value in at_once.tensors(FEATURES).items():
+            assert torch.equal(value, torch.cat([part[key] for part in parts])), key
+        assert torch.equal(at_once.corrective, torch.cat([drawn.corrective for drawn in singly]))
 
 
 def test_corrective_frames_do_not_depend_on_how_many_are_drawn_together(small_maze, monkeypatch):
     """Blocks bound the memory; they do not change what is drawn."""
     drawn = []
     for block in (256, 7):
-        monkeypatch.setattr("lerobot_swr.policies.corrections.BLOCK", block)
+        monkeypatch.setattr("lerobot_swr.corrective.frames.BLOCK", block)
         policy, meta = make(small_maze, corrective="demos")
         drawn.append(policy.draw(batch_of(policy, meta, every_frame(policy))))
-    for key in ("style_episode", STATE, ACTION):
-        torch.testing.assert_close(drawn[0][key], drawn[1][key], atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("size", [16, 5, 1])
-def test_before_all_episodes_are_seen_only_the_frames_asked_for_are_drawn(servo_dataset, monkeypatch, size):
-    """They are those of a whole block; many steps at once are the same as one by one, bit for bit."""
-    one, meta = make(servo_dataset, corrective="demos")
-    rows = every_frame(one)
-    seen = rows[rows < 3 * 90]  # of episodes 0 to 2
-    one.draw(batch_of(one, meta, seen))
-    many, labels, counts = copy.deepcopy(one), one.corrections.labels, []
-    draw = labels.draw
-    monkeypatch.setattr(labels, "draw", lambda u, candidates: counts.append(len(u)) or draw(u, candidates))
-    steps = seen[: 10 * size].view(10, size)
-    singly = [one.draw(batch_of(one, meta, step)) for step in steps]
-    at_once = many.draw(batch_of(many, meta, steps.flatten()), len(steps))
-    corrective = at_once["corrective"]
-    for key in ("style_episode", "weight", STATE, ACTION):
-        expected = torch.cat([drawn[key][drawn["corrective"]] for drawn in singly])
-        assert torch.equal(at_once[key][corrective], expected), key
-    assert sum(counts) == int(corrective.sum())
-    per_frame = labels.draws_per_frame
-    block = draw(one.corrections.draws.uniforms_at(0, 256, per_frame).reshape(256, per_frame), np.arange(3))
-    first = len(seen) // 2
-    expected = block.episodes[first : first + sum(counts)].tolist()
-    assert at_once["style_episode"][corrective].tolist() == expected
+    found = [lesson.tensors(FEATURES) for lesson in drawn]
+    for key in ("episode", STATE, ACTION):
+        torch.testing.assert_close(found[0][key], found[1][key], atol=1e-5, rtol=1e-5)
 
 
 def test_pairs_and_corrective_draws_are_independent(small_maze):
     """The streams of random numbers differ, and each step's differ from the last one's."""
     policy, _ = make(small_maze, "wzbc", corrective="noise")
-    pairs, labels = policy.draws.uniforms(2, 500), policy.corrections.draws.uniforms(2, 500)
+    pairs, labels = policy.relabel.draws.uniforms(2, 500), policy.correct.draws.uniforms(2, 500)
     assert abs(np.corrcoef(pairs, labels)[0, 1]) < 0.15
     assert abs(np.corrcoef(labels[:500], labels[500:])[0, 1]) < 0.2
 
@@ -193,9 +176,9 @@ def test_figures_count_each_kind_of_frame_for_itself(small_maze):
     """corrective_loss, own_style_loss and relabelled_loss recomputed from the drawn frames' errors."""
     policy, meta = make(small_maze, "wzbc", corrective="demos", p=0.4)
     drawn = policy.draw(batch_of(policy, meta, every_frame(policy)))
-    losses = policy.frame_losses(drawn).detach()
-    figures = policy.figures(drawn, losses)
-    corrective, relabelled = drawn["corrective"], drawn["relabelled"]
+    losses = policy.loss(drawn)[1].detach()
+    figures = logged(policy.steps, drawn, losses)
+    corrective, relabelled = drawn.corrective, ~drawn.teaches_style
     assert figures["corrective_loss"] == pytest.approx(float((losses * corrective).mean() / 0.5), rel=1e-5)
     own = ~corrective & ~relabelled
     assert figures["own_style_loss"] == pytest.approx(float((losses * own).mean() / 0.6 / 0.5), rel=1e-5)
@@ -211,7 +194,7 @@ def test_demos_says_how_many_states_others_lend(small_maze, caplog):
     with caplog.at_level("INFO"):
         policy, _ = make(small_maze, corrective="demos")
     logged = float(re.search(r"corrective=demos: about (\d+) %", caplog.text)[1]) / 100
-    labels = policy.corrections.labels
+    labels = policy.correct.stream.labels
     numbers = np.random.default_rng(5).random((2000, labels.draws_per_frame))
     assert 0 < logged < 1
     assert logged == pytest.approx(labels.draw(numbers, np.arange(6)).borrowed.mean(), abs=0.12)

@@ -9,6 +9,7 @@ import torch
 from conftest import save_checkpoint
 from corrective_policies import ACTION, LAG, STATE, batch_of, every_frame, make
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from safetensors.torch import load_file
@@ -16,7 +17,8 @@ from safetensors.torch import load_file
 from lerobot_swr.corrective.relative_actions import RelativeActions, Units
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.evaluation.offline import frame_errors
-from lerobot_swr.policies.style_extension import add_demonstrations
+from lerobot_swr.run_context import running
+from lerobot_swr.styles.extension import add_demonstrations
 
 
 def test_absolute_targets_are_learned_relative_to_the_state(servo_dataset):
@@ -26,15 +28,14 @@ def test_absolute_targets_are_learned_relative_to_the_state(servo_dataset):
     assert abs(policy.config.inverse_horizon - LAG) <= 1
     batch = batch_of(policy, meta, every_frame(policy))
     drawn = policy.draw(batch)
-    own = ~drawn["corrective"]
+    own = ~drawn.corrective
     leads = policy.trajectories.columns[ACTION] - policy.trajectories.columns[STATE]
     expected = ((leads - leads.mean(axis=0)) / leads.std(axis=0))[batch["index"][own]]
-    np.testing.assert_allclose(drawn[ACTION][own], expected, atol=2e-4)
-    decoded = policy.corrections.decode(drawn[ACTION], drawn)
+    np.testing.assert_allclose(drawn.batch[ACTION][own], expected, atol=2e-4)
+    decoded = policy.relative.decode(drawn.batch[ACTION], drawn.batch[STATE])
     torch.testing.assert_close(decoded[own], batch[ACTION][own], atol=1e-4, rtol=1e-4)
-    policy.eval()
-    policy.styles.trained.fill_(1)
-    assert torch.allclose(policy.draw(batch)[ACTION][own], drawn[ACTION][own])
+    encoded = policy.relative.encode(batch[ACTION], batch[STATE])
+    assert torch.allclose(encoded[own], drawn.batch[ACTION][own])
 
 
 def test_relative_checkpoints_act_the_same_without_their_dataset(servo_dataset, tmp_path):
@@ -49,10 +50,10 @@ def test_relative_checkpoints_act_the_same_without_their_dataset(servo_dataset, 
     style = policy.styles.embedding(batch["episode_index"])
     assert torch.equal(checkpoint.policy.predict(batch, style), policy.predict(batch, style))
     stored = load_file(folder / "model.safetensors")
-    assert {k for k in stored if k.startswith("corrections.")} == {
-        "corrections.draws.seed",
-        "corrections.draws.step",
-        *(f"corrections.relative.{name}" for name in ("offset", "scale", "state_gain")),
+    assert {k for k in stored if k.startswith(("correct.", "relative."))} == {
+        "correct.draws.seed",
+        "correct.draws.step",
+        *(f"relative.{name}" for name in ("offset", "scale", "state_gain")),
     }
     saved = json.loads((folder / "config.json").read_text())
     assert saved["inverse_r2"] == policy.config.inverse_r2
@@ -68,8 +69,8 @@ def test_relative_checkpoints_act_the_same_without_their_dataset(servo_dataset, 
 
 def test_styles_are_encoded_by_the_error_of_actions(servo_dataset):
     """Held-out and added demonstrations: the reported error is that of the policy's actions."""
-    policy, meta = make(servo_dataset, corrective="noise")
-    policy.styles.trained[:4] = 1
+    with running(DatasetConfig("local/servo", episodes=[0, 1, 2, 3])):
+        policy, meta = make(servo_dataset, corrective="noise")
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     added = add_demonstrations(policy, preprocessor, policy.trajectories, policy.trajectories, [5])
     start, length = policy.trajectories.starts[5], policy.trajectories.lengths[5]
@@ -85,7 +86,7 @@ def test_relative_actions_can_be_switched_off_and_horizons_set(servo_dataset):
     policy, _ = make(servo_dataset, corrective="noise", corrective_relative=False, corrective_horizon=2)
     assert policy.config.action_targets is None
     assert policy.config.inverse_horizon == 2
-    assert policy.corrections.relative is None
+    assert policy.relative is None
 
 
 # --- Fine-tuning: what outputs mean ---
@@ -112,16 +113,16 @@ def test_a_plain_checkpoint_keeps_predicting_actions(servo_dataset, tmp_path, ca
     style = plain.styles.embedding(batch["episode_index"])
     assert torch.equal(tuned.predict(batch, style), plain.predict(batch, style))
     drawn = tuned.draw(batch)
-    own = ~drawn["corrective"]
-    assert torch.equal(drawn[ACTION][own], batch[ACTION][own])
+    own = ~drawn.corrective
+    assert torch.equal(drawn.batch[ACTION][own], batch[ACTION][own])
     # Labels lead towards the path by no more than demonstrated, as a policy's that is trained anew.
     anew, _ = make(servo_dataset, corrective="noise")
-    anew.corrections.draws.load_state_dict(tuned.corrections.draws.state_dict())
-    tuned.corrections.draws.step.zero_()
-    anew.corrections.draws.step.zero_()
+    anew.correct.draws.load_state_dict(tuned.correct.draws.state_dict())
+    tuned.correct.draws.step.zero_()
+    anew.correct.draws.step.zero_()
     labels = [policy.draw(batch) for policy in (tuned, anew)]
-    decoded = anew.corrections.decode(labels[1][ACTION], labels[1])
-    torch.testing.assert_close(labels[0][ACTION], decoded, atol=1e-4, rtol=1e-4)
+    decoded = anew.relative.decode(labels[1].batch[ACTION], labels[1].batch[STATE])
+    torch.testing.assert_close(labels[0].batch[ACTION], decoded, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("kind", ["none", "demos"])
@@ -139,9 +140,9 @@ def test_a_relative_checkpoint_stays_relative(servo_dataset, small_maze, tmp_pat
     leads = columns[ACTION] - columns[STATE]
     batch = batch_of(tuned, new_meta, every_frame(tuned))
     drawn = tuned.draw(batch)
-    own = ~drawn["corrective"] if kind == "demos" else torch.ones(len(batch["index"]), dtype=bool)
+    own = ~drawn.corrective if kind == "demos" else torch.ones(len(batch["index"]), dtype=bool)
     expected = ((leads - leads.mean(axis=0)) / leads.std(axis=0))[batch["index"][own]]
-    np.testing.assert_allclose(drawn[ACTION][own], expected, atol=1e-3)
+    np.testing.assert_allclose(drawn.batch[ACTION][own], expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("relative", [True, False])

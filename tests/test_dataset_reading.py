@@ -29,8 +29,9 @@ from odd_datasets import (
     write,
 )
 
-from lerobot_swr.configuration import training_on
 from lerobot_swr.frame_rows import FrameRows
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
+from lerobot_swr.run_context import running
 from lerobot_swr.trajectories import load_trajectories
 
 KEYS = [STATE, ACTION]
@@ -39,7 +40,7 @@ KEYS = [STATE, ACTION]
 def make(root, policy_type="zbc", **options):
     """A small policy on a dataset."""
     config = make_policy_config(
-        policy_type, hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False, **options
+        policy_type, backbone=MLPConfig(8, 1), device="cpu", push_to_hub=False, **options
     )
     return make_policy(config, ds_meta=metadata(root))
 
@@ -104,7 +105,7 @@ def test_a_stray_file_that_lerobot_would_train_on_is_refused(copied_arcs, episod
         table.set_column(place, STATE, shifted), data_file(copied_arcs).with_name(f"{name}.parquet")
     )
     refused = pytest.raises(ValueError, match=r"data/chunk-000/file-000.*move it out of the data folder")
-    with training_on(DatasetConfig("local/odd", episodes=episodes)), refused:
+    with running(DatasetConfig("local/odd", episodes=episodes)), refused:
         make(copied_arcs)
     if episodes is not None:
         make(copied_arcs)  # all episodes: LeRobot does not come to it
@@ -124,7 +125,7 @@ def test_chosen_episodes_that_lerobot_would_not_find_are_refused(copied_arcs):
     """For them it needs the column index, which restarts here."""
     set_column(copied_arcs, "index", np.r_[np.arange(14), np.arange(22)], pa.int64())
     refused = pytest.raises(ValueError, match=r"index of episode 3 does not run from 24 to 35")
-    with training_on(DatasetConfig("local/odd", episodes=[3])), refused:
+    with running(DatasetConfig("local/odd", episodes=[3])), refused:
         make(copied_arcs)
 
 

@@ -12,6 +12,8 @@ from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_edit_dataset
 from odd_datasets import ACTION, PLAIN, STATE, arc, arcs, edit_json, feature, metadata, write
 
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
+
 QUANTILES = {"STATE": "QUANTILES", "ACTION": "QUANTILES"}
 EDGES = {"STATE": "MIN_MAX", "ACTION": "MIN_MAX"}
 
@@ -21,7 +23,7 @@ def make(root, policy_type="zbc", mapping=None):
     meta = metadata(root)
     options = {} if mapping is None else {"normalization_mapping": mapping}
     if policy_type in ("bc", "zbc"):
-        options |= {"hidden_dim": 8, "num_hidden": 1}
+        options |= {"backbone": MLPConfig(8, 1)}
     policy = make_policy(
         make_policy_config(policy_type, device="cpu", push_to_hub=False, **options), ds_meta=meta
     )
@@ -107,7 +109,7 @@ def test_statistics_may_be_checked_again(tmp_path):
     )
     meta = metadata(root)
     for _ in range(2):
-        make_policy(make_policy_config("bc", hidden_dim=8, num_hidden=1, device="cpu"), ds_meta=meta)
+        make_policy(make_policy_config("bc", backbone=MLPConfig(8, 1), device="cpu"), ds_meta=meta)
     assert meta.stats["observation.still"]["std"][0] == 1
     np.testing.assert_array_equal(meta.stats["observation.grid"]["std"][[1, 3]], 1)
 

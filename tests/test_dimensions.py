@@ -4,7 +4,6 @@ import re
 
 import numpy as np
 import pytest
-import torch
 from conftest import save_checkpoint
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_policy
@@ -13,6 +12,7 @@ from odd_datasets import ACTION, STATE, arc, arcs, feature, metadata, write
 
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.cli import styles as styles_command
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 
 SHAPES = {"state": {STATE: 3, ACTION: 2}, "action": {STATE: 2, ACTION: 3}}
 
@@ -35,10 +35,8 @@ def wider(request, tmp_path_factory):
 def trained(policy_type, root, folder):
     """A checkpoint of a small policy with a style for every episode."""
     meta = metadata(root)
-    config = make_policy_config(policy_type, hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False)
+    config = make_policy_config(policy_type, backbone=MLPConfig(8, 1), device="cpu", push_to_hub=False)
     policy = make_policy(config, ds_meta=meta)
-    if policy_type == "zbc":
-        policy.styles.mark_trained(torch.arange(4))
     return save_checkpoint(policy, meta, folder)
 
 

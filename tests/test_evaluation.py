@@ -26,7 +26,12 @@ def trained_zbc(small_maze, tmp_path_factory):
     from lerobot.scripts import lerobot_train
 
     output_dir = tmp_path_factory.mktemp("runs") / "zbc"
-    flags = ("--policy.hidden_dim=64", "--policy.num_hidden=4", "--save_checkpoint=true", "--log_freq=500")
+    flags = (
+        "--policy.backbone.hidden_dim=64",
+        "--policy.backbone.num_hidden=4",
+        "--save_checkpoint=true",
+        "--log_freq=500",
+    )
     before = sys.argv
     sys.argv = ["lerobot-train", *train_flags("zbc", small_maze, output_dir, 1500, *flags)]
     try:

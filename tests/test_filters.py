@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lerobot_swr.filters import FilterError, names_in, parse_filter, select
+from lerobot_swr.styles.filters import FilterError, names_in, parse_filter, select
 
 TABLE = {
     "length": [62.0, 70.0, 75.0, 80.0, 101.0],

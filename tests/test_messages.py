@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +26,18 @@ from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.cli import train as train_command
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.literal_flags import with_literal_text
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 
-SMALL = ("--policy.hidden_dim=8", "--policy.num_hidden=1")
+SMALL = ("--policy.backbone.hidden_dim=8", "--policy.backbone.num_hidden=1")
 
 
 def checkpoint(root, folder, policy_type="zbc"):
     """A checkpoint of a small policy with a style for every episode."""
     meta = metadata(root)
     policy = make_policy(
-        make_policy_config(policy_type, hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False),
+        make_policy_config(policy_type, backbone=MLPConfig(8, 1), device="cpu", push_to_hub=False),
         ds_meta=meta,
     )
-    if policy_type == "zbc":
-        policy.styles.mark_trained(torch.arange(4))
     return save_checkpoint(policy, meta, folder)
 
 
@@ -258,51 +258,66 @@ def test_ctrl_c_and_a_full_disk_end_in_one_line(error, code, message, capsys):
     assert len(told.splitlines()) == 1
 
 
-def start_training(plain_arcs, run: Path, *flags: str, largest_file: int = -1) -> subprocess.Popen:
-    """``lerobot-swr-train`` in a process group of its own, as in a terminal."""
+@pytest.fixture
+def start_training(plain_arcs):
+    """Starts ``lerobot-swr-train`` in a process group of its own, as in a terminal.
 
-    def prepare():
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
-        resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+    Gives the process, and what it will have said when it has ended.
+    """
+    started: list[subprocess.Popen] = []
 
-    command = [sys.executable, "-c", "from lerobot_swr.cli.train import main; main()"]
-    return subprocess.Popen(
-        [*command, *train_flags("zbc", plain_arcs, run, 100_000, *SMALL, "--seeds=0,1", *flags)],
-        env={**os.environ, "HF_HUB_OFFLINE": "1"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=prepare,
-    )
+    def start(run: Path, *flags: str, largest_file: int = -1) -> tuple[subprocess.Popen, Future]:
+        def prepare():
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # background jobs of a shell ignore it
+            resource.setrlimit(resource.RLIMIT_FSIZE, (largest_file, largest_file))
+
+        command = [sys.executable, "-c", "from lerobot_swr.cli.train import main; main()"]
+        process = subprocess.Popen(
+            [*command, *train_flags("zbc", plain_arcs, run, 100_000, *SMALL, "--seeds=0,1", *flags)],
+            env={**os.environ, "HF_HUB_OFFLINE": "1"},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=prepare,
+        )
+        started.append(process)
+        assert process.stderr is not None
+        return process, ThreadPoolExecutor(1).submit(process.stderr.read)  # a full pipe would stop it
+
+    yield start
+    for process in started:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
 
 
-def last_words(process: subprocess.Popen) -> str:
+def last_words(process: subprocess.Popen, told: Future) -> str:
     """What a process says last, when it has ended."""
-    told = process.communicate(timeout=600)[1].replace("\r", "\n").strip()
-    assert "Traceback" not in told.split("[end of libtorchcodec loading traceback]")[-1]
-    return told.splitlines()[-1]
+    process.wait(timeout=600)
+    said = told.result().replace("\r", "\n").strip()
+    assert "Traceback" not in said.split("[end of libtorchcodec loading traceback]")[-1]
+    return said.splitlines()[-1]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_ctrl_c_in_training_leaves_a_whole_checkpoint_and_no_stack_trace(plain_arcs, tmp_path, jobs):
+def test_ctrl_c_in_training_leaves_a_whole_checkpoint_and_no_stack_trace(start_training, tmp_path, jobs):
     """The terminal sends it to every process of the command."""
     run = tmp_path / "run"
-    process = start_training(plain_arcs, run, "--save_freq=500", f"--jobs={jobs}")
+    process, told = start_training(run, "--save_freq=50", f"--jobs={jobs}")
     while not (run / "seed_1/checkpoints/last").exists():
         assert process.poll() is None
         time.sleep(0.05)
     os.killpg(process.pid, signal.SIGINT)
-    assert last_words(process).startswith("interrupted;")
+    assert last_words(process, told).startswith("interrupted;")
     assert process.returncode == 130
     assert (run / "seed_1/checkpoints/last/pretrained_model/model.safetensors").is_file()
 
 
-def test_a_disk_that_is_full_in_training_is_told(plain_arcs, tmp_path):
+def test_a_disk_that_is_full_in_training_is_told(start_training, tmp_path):
     """Here no file may be larger than a few kilobytes, which the weights are."""
-    process = start_training(
-        plain_arcs, tmp_path / "run", "--save_freq=1", "--jobs=1", "--policy.hidden_dim=64", largest_file=9000
+    process, told = start_training(
+        tmp_path / "run", "--save_freq=1", "--jobs=1", "--policy.backbone.hidden_dim=64", largest_file=9000
     )
-    assert last_words(process).startswith("error: the disk is full")
+    assert last_words(process, told).startswith("error: the disk is full")
     assert process.returncode == 2
     assert not list(tmp_path.glob("run/seed_*/checkpoints/0*"))

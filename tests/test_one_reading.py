@@ -24,13 +24,14 @@ from odd_datasets import (
 )
 from safetensors.torch import load_file
 
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 from lerobot_swr.policies.processor_swr import FloatVectorsProcessorStep
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.memory_dataset import MemoryDataset
 from lerobot_swr.training.seed_runs import SeedRuns
 from lerobot_swr.training.seed_training import _prepared_frames
 
-SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
+SMALL = ("--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2", "--log_freq=5")
 EXTRA = "observation.extra"
 
 
@@ -81,7 +82,7 @@ def batch_of(root, rows, **options):
 def test_lerobots_batches_arrive_as_normalised_vectors(odd):
     """Against the written numbers, with mean and standard deviation computed here: float32, (B, d)."""
     root, numbers = odd
-    policy, meta = make(root, hidden_dim=8, num_hidden=1)
+    policy, meta = make(root, backbone=MLPConfig(8, 1))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     rows = np.random.default_rng(0).permutation(len(numbers))[:7]
     batch = preprocessor(batch_of(root, rows))
@@ -101,7 +102,7 @@ def test_both_trainers_see_the_same_frames(odd, tmp_path):
     root, numbers = odd
     config = SeedsTrainConfig(
         dataset=DatasetConfig("local/odd", root=str(root)),
-        policy=make_policy_config("bc", hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False),
+        policy=make_policy_config("bc", backbone=MLPConfig(8, 1), device="cpu", push_to_hub=False),
         output_dir=tmp_path / "run",
         seeds=[0],
         jobs=1,
@@ -118,7 +119,7 @@ def test_both_trainers_see_the_same_frames(odd, tmp_path):
 def test_statistics_are_saved_as_they_are_and_actions_come_back(odd, tmp_path):
     """A checkpoint's processors, loaded again: not rounded to the data's type, each other's inverse."""
     root, numbers = odd
-    policy, meta = make(root, hidden_dim=8, num_hidden=1)
+    policy, meta = make(root, backbone=MLPConfig(8, 1))
     folder = save_checkpoint(policy, meta, tmp_path / "checkpoint")
     preprocessor, postprocessor = make_pre_post_processors(policy.config, str(folder))
     batch = preprocessor(batch_of(root, range(5)))
@@ -159,7 +160,7 @@ def test_both_trainers_learn_the_same_from_odd_data(tmp_path, lerobot_train_comm
     weights = [load_file(folder / "model.safetensors") for folder in (one, other)]
     for key, value in weights[0].items():
         torch.testing.assert_close(value, weights[1][key], rtol=1e-2, atol=1e-3, msg=key)
-    policy, _ = make(root, hidden_dim=16, num_hidden=2)
+    policy, _ = make(root, backbone=MLPConfig(16, 2))
     preprocessor, _ = make_pre_post_processors(policy.config, str(one))
     batch = preprocessor(batch_of(root, range(36)))
     before = policy.forward(batch)[0]
@@ -193,7 +194,7 @@ def test_windows_of_scalars_keep_their_steps(policy_type, tmp_path):
 
 def test_observations_of_an_environment_in_double_precision_are_taken(plain_arcs):
     """They are cast, and a single frame gets the dimension of a batch; the normaliser stays in float32."""
-    policy, meta = make(plain_arcs, hidden_dim=8, num_hidden=1)
+    policy, meta = make(plain_arcs, backbone=MLPConfig(8, 1))
     preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=meta.stats)
     for frame in (torch.zeros(3, 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)):
         batch = preprocessor({STATE: frame})
@@ -203,7 +204,7 @@ def test_observations_of_an_environment_in_double_precision_are_taken(plain_arcs
 
 def test_a_batch_that_was_not_prepared_is_refused_by_the_loss(plain_arcs):
     """(B, A) minus (B,) would be broadcast to (B, B), and a plausible loss would teach nothing."""
-    policy, _ = make(plain_arcs, hidden_dim=8, num_hidden=1)
+    policy, _ = make(plain_arcs, backbone=MLPConfig(8, 1))
     batch = {STATE: torch.zeros(2, 2), "episode_index": torch.tensor([0, 1]), ACTION: torch.zeros(2)}
     with pytest.raises(ValueError, match=r"actions have shape \[2\], those predicted \[2, 2\]"):
         policy.forward(batch)
@@ -234,7 +235,7 @@ def test_what_no_network_can_use_is_left_out(tmp_path, caplog):
         return {**arcs(i, t, n), **extra}
 
     root = write(tmp_path / "data", features, frame)
-    policy, meta = make(root, hidden_dim=8, num_hidden=1)
+    policy, meta = make(root, backbone=MLPConfig(8, 1))
     assert list(policy.config.input_features) == [STATE]
     assert list(policy.config.output_features) == [ACTION]
     assert "left out: observation.note, observations.qpos" in caplog.text
@@ -248,7 +249,7 @@ def test_frames_of_files_in_another_order_are_lerobots(copied_arcs, tmp_path, ep
     split_into_files(copied_arcs, [1, 0, 3])
     config = SeedsTrainConfig(
         dataset=DatasetConfig("local/odd", root=str(copied_arcs), episodes=episodes),
-        policy=make_policy_config("bc", hidden_dim=8, num_hidden=1, device="cpu", push_to_hub=False),
+        policy=make_policy_config("bc", backbone=MLPConfig(8, 1), device="cpu", push_to_hub=False),
         output_dir=tmp_path / "run",
         seeds=[0],
         jobs=1,

@@ -6,6 +6,7 @@ import torch
 from conftest import make_batch
 
 from lerobot_swr.pauses import pause_frames
+from lerobot_swr.policies.lessons import Lesson
 from lerobot_swr.trajectories import Trajectories
 
 MOVE = 0.5
@@ -97,7 +98,7 @@ def test_pauses_teach_nothing_and_the_mean_weight_is_one(make_tiny_policy, monke
         marked["pauses"] = np.arange(trajectories.lengths.sum()) % 5 == 1
         return marked["pauses"]
 
-    monkeypatch.setattr("lerobot_swr.policies.dataset_policy.pause_frames", mark)
+    monkeypatch.setattr("lerobot_swr.policies.training_data.pause_frames", mark)
     policy = make_tiny_policy("zbc", balance_episodes=balance)
     trajectories, pauses = policy.trajectories, marked["pauses"]
     episodes = np.repeat(np.arange(len(trajectories)), trajectories.lengths)
@@ -105,7 +106,7 @@ def test_pauses_teach_nothing_and_the_mean_weight_is_one(make_tiny_policy, monke
     batch["episode_index"] = torch.from_numpy(episodes)
     batch["index"] = torch.arange(len(episodes))
     losses, _ = policy.forward(batch, reduction="none")
-    weights = policy.frame_weights(batch).numpy()
+    weights = policy.balance(Lesson.of(batch)).weight.numpy()
     assert (losses.detach().numpy()[pauses] == 0).all()
     assert (losses.detach().numpy()[~pauses] > 0).all()
     assert weights.mean() == pytest.approx(1)
@@ -116,5 +117,5 @@ def test_pauses_teach_nothing_and_the_mean_weight_is_one(make_tiny_policy, monke
 
 def test_pauses_can_be_kept(make_tiny_policy, monkeypatch):
     """`skip_pauses=false` learns every frame, as the paper does."""
-    monkeypatch.setattr("lerobot_swr.policies.dataset_policy.pause_frames", lambda *_: pytest.fail("looked"))
-    assert make_tiny_policy("zbc", skip_pauses=False).pauses is None
+    monkeypatch.setattr("lerobot_swr.policies.training_data.pause_frames", lambda *_: pytest.fail("looked"))
+    assert make_tiny_policy("zbc", skip_pauses=False).data.pauses is None

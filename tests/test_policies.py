@@ -12,14 +12,16 @@ import torch
 from conftest import make_batch, save_checkpoint
 from huggingface_hub import ModelCard
 from lerobot.configs import PreTrainedConfig
+from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.policies.factory import get_policy_class, make_policy_config
 
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
-from lerobot_swr.similarity import normalize_distances, similarity_weights
+from lerobot_swr.run_context import RunContext, running
 
 STYLE_POLICIES = ("zbc", "wzbc")
 
@@ -34,9 +36,8 @@ def gradients(policy, batch):
 
 def drawn_pairs(policy, batch):
     """The pairs that the policy's next training step will draw."""
-    policy.sampler.set_candidates(policy.styles.trained)
-    uniforms = copy.deepcopy(policy.draws).uniforms(1, len(batch["episode_index"]))
-    return policy.sampler.draw(batch["episode_index"], uniforms)
+    uniforms = copy.deepcopy(policy.relabel.draws).uniforms(1, len(batch["episode_index"]))
+    return policy.relabel.sampler.draw(batch["episode_index"], uniforms)
 
 
 def reload(policy, meta, folder, **overrides):
@@ -82,13 +83,12 @@ def test_styles_learn_from_their_own_frames_alone(make_tiny_policy, partner_samp
         "wzbc", beta=1.0, p=0.5, balance_episodes=False, partner_sampling=partner_sampling
     )
     batch = make_batch()
-    policy.styles.mark_trained(batch["episode_index"])
     pairs = drawn_pairs(policy, batch)
     _, grads, _ = gradients(policy, batch)
     assert 0 < pairs.relabelled.sum() < len(pairs.relabelled)
     policy.zero_grad()
     own = {key: value[~pairs.relabelled] for key, value in batch.items()}
-    predicted = policy.network(own, policy.styles.embedding(own["episode_index"]))
+    predicted = policy.backbone(own, policy.styles.embedding(own["episode_index"]))
     errors = ((predicted - own["action"]) ** 2).mean(dim=1)
     (errors * pairs.weights[~pairs.relabelled]).sum().div(len(pairs.relabelled)).backward()
     torch.testing.assert_close(policy.styles.embedding.weight.grad, grads["styles.embedding.weight"])
@@ -118,14 +118,14 @@ def test_the_logged_figures_are_what_they_name(make_tiny_policy, partner_samplin
         "wzbc", beta=1.0, p=0.5, partner_sampling=partner_sampling, balance_episodes=False
     )
     batch = make_batch(n_frames=60_000)
-    policy.styles.mark_trained(batch["episode_index"])
     _, figures = policy.train().forward(batch)
 
-    weights = similarity_weights(normalize_distances(policy.distances()), policy.config.beta)
+    distances = policy.data.similarity.distance(np.arange(6)[:, None], np.arange(6))
+    weights = np.exp(-distances / distances.max(axis=1, keepdims=True))
     frames = make_batch(n_frames=600)
     errors = torch.stack(
         [
-            (policy.network(frames, policy.styles.embedding.weight[j].expand(600, -1)) - frames["action"])
+            (policy.backbone(frames, policy.styles.embedding.weight[j].expand(600, -1)) - frames["action"])
             .square()
             .mean(dim=1)
             for j in range(6)
@@ -175,7 +175,7 @@ def test_styles_are_constant_in_an_episode_and_independent_across_environments(m
     styles = policy.styles.active.clone()
     for seed in range(3):
         step = make_batch(64, seed=seed)
-        expected = policy.network(step, policy.styles.embedding(styles))
+        expected = policy.backbone(step, policy.styles.embedding(styles))
         torch.testing.assert_close(policy.select_action(step), expected)
     assert torch.equal(policy.styles.active, styles)
     assert len(styles.unique()) == 6
@@ -194,12 +194,8 @@ def test_inference_options_are_flags_of_the_loaded_policy(make_tiny_policy, smal
 
 
 def test_only_trained_episodes_are_drawn_after_loading(make_tiny_policy, small_maze_meta, tmp_path):
-    """The checkpoint remembers which episodes were trained."""
-    policy = make_tiny_policy("wzbc")
-    policy.train()
-    batch = make_batch()
-    batch["episode_index"] = torch.where(batch["episode_index"] > 3, 1, batch["episode_index"])
-    policy.forward(batch)
+    """The checkpoint remembers on which episodes it was made to train."""
+    policy = make_tiny_policy("wzbc", episodes=[0, 1, 2, 3])
     loaded = reload(policy, small_maze_meta, tmp_path / "c")
     loaded.reset()
     loaded.select_action(make_batch(200))
@@ -219,8 +215,29 @@ def test_fine_tuning_on_other_data_keeps_the_network_and_starts_new_styles(
         tuned = make_policy(config, ds_meta=LeRobotDatasetMetadata("local/other", root=tmp_path / "other"))
     assert "3 new styles" in caplog.text
     assert len(tuned.styles) == 3
-    assert tuned.styles.trained.sum() == 0
-    assert torch.equal(tuned.network.head.weight, policy.network.head.weight)
+    assert tuned.styles.trained.tolist() == [1, 1, 1]
+    assert torch.equal(tuned.backbone.head.weight, policy.backbone.head.weight)
+
+
+@pytest.mark.parametrize("policy_type", STYLE_POLICIES)
+def test_frames_of_episodes_that_are_left_out_are_refused(make_tiny_policy, policy_type):
+    """They would get a style that is never drawn; the message names them and the way to train on them."""
+    policy = make_tiny_policy(policy_type, episodes=[0, 1, 2, 3]).train()
+    with pytest.raises(ValueError, match=r"episodes \[4, 5\], .*--dataset.episodes .*running"):
+        policy.forward(make_batch())
+
+
+def test_what_was_trained_before_is_still_drawn_after_training_on_others(
+    make_tiny_policy, small_maze_meta, tmp_path
+):
+    """A checkpoint of episodes 0 and 1 that is continued on 1 and 4 has styles of all three."""
+    folder = save_checkpoint(make_tiny_policy("zbc", episodes=[0, 1]), small_maze_meta, tmp_path / "c")
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path = folder
+    with running(DatasetConfig("local/small_maze", episodes=[1, 4])):
+        tuned = make_policy(config, ds_meta=small_maze_meta)
+    assert tuned.data.run == RunContext((1, 4), resuming=False)
+    assert tuned.styles.trained.tolist() == [1, 1, 0, 0, 1, 0]
 
 
 def test_continuing_on_the_same_data_keeps_the_styles(make_tiny_policy, small_maze_meta, tmp_path):
@@ -232,9 +249,12 @@ def test_continuing_on_the_same_data_keeps_the_styles(make_tiny_policy, small_ma
     torch.manual_seed(7)
     loaded = make_policy(config, ds_meta=small_maze_meta)
     for name, value in policy.state_dict().items():
-        if not name.startswith("draws."):
+        if not name.startswith("relabel.draws."):
             assert torch.equal(value, loaded.state_dict()[name]), name
-    assert (loaded.draws.seed, loaded.draws.step) == (7, 0)  # a new run draws the numbers of its own seed
+    assert (loaded.relabel.draws.seed, loaded.relabel.draws.step) == (
+        7,
+        0,
+    )  # a new run draws the numbers of its own seed
 
 
 def test_constant_dimensions_are_centred_not_blown_up(make_tiny_policy, small_maze_meta):
@@ -252,7 +272,7 @@ def test_the_papers_literal_network_is_one_flag_set():
     """Plain layers, constant learning rate, unit styles, no normalisation."""
     config = make_policy_config(
         "wzbc",
-        residual=False,
+        backbone=MLPConfig(residual=False),
         lr_schedule="constant",
         style_init_scale=1.0,
         style_lr_scale=1.0,
@@ -261,7 +281,7 @@ def test_the_papers_literal_network_is_one_flag_set():
         device="cpu",
     )
     assert config.get_scheduler_preset() is None
-    assert (config.hidden_dim, config.num_hidden, config.style_dim) == (128, 10, 10)
+    assert (config.backbone.hidden_dim, config.backbone.num_hidden, config.style_dim) == (128, 10, 10)
     assert (config.beta, config.p, config.optimizer_lr) == (10.0, 0.8, 1e-3)
 
 
@@ -298,7 +318,7 @@ def test_the_model_card_says_how_to_install_the_plugin(make_tiny_policy, monkeyp
         ("zbc", {"style_sampling": "some"}, "style_sampling='some'"),
         ("zbc", {"style_dim": 0}, "style_dim=0"),
         ("zbc", {"style_lr_scale": 0}, "style_lr_scale=0"),
-        ("bc", {"num_hidden": 0}, "num_hidden=0"),
+        ("bc", {"hidden_dim": 64}, "give --policy.backbone.hidden_dim=64"),
         ("bc", {"lr_schedule": "linear"}, "lr_schedule='linear'"),
     ],
 )

@@ -20,6 +20,7 @@ from lerobot_swr.envs.pusht.task import PushTTask
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import load_checkpoint, load_demonstrations
 from lerobot_swr.evaluation.rollouts import run_rollouts
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 
 pytest.importorskip("gym_pusht", reason="absent: pip install 'lerobot_policy_swr[pusht]'")
 
@@ -58,7 +59,7 @@ def checkpoint(pushes, tmp_path):
     """Folder of a small, untrained policy."""
     torch.manual_seed(0)
     meta = LeRobotDatasetMetadata("local/pushes", root=pushes)
-    config = make_policy_config("bc", hidden_dim=8, num_hidden=2, device="cpu", push_to_hub=False)
+    config = make_policy_config("bc", backbone=MLPConfig(8, 2), device="cpu", push_to_hub=False)
     return save_checkpoint(make_policy(config, ds_meta=meta), meta, tmp_path / "policy")
 
 

@@ -29,7 +29,9 @@ def offline_errors(run_command, checkpoint: Path, output_dir: Path) -> dict[str,
 @pytest.mark.parametrize("policy_type", ["zbc", "wzbc"])
 def test_a_few_steps_on_real_data_tell_styles_apart(run_command, tmp_path, policy_type):
     """After a few hundred steps an episode is explained better by its own style than by a random one."""
-    flags = train_flags(policy_type, DATASET, tmp_path / "run", 300, "--policy.num_hidden=3", "--jobs=1")
+    flags = train_flags(
+        policy_type, DATASET, tmp_path / "run", 300, "--policy.backbone.num_hidden=3", "--jobs=1"
+    )
     run_command(train_command.main, *flags, "--seeds=0", "--policy.style_lr_scale=20")
     checkpoint = tmp_path / "run/seed_0/checkpoints/last/pretrained_model"
     errors = offline_errors(run_command, checkpoint, tmp_path / "eval")

@@ -30,7 +30,7 @@ def test_what_defines_a_cell_is_its_identity():
         ("steps", 21),
         ("seeds", 3),
         ("batch_size", 8),
-        ("policy_options", {"hidden_dim": 17}),
+        ("policy_options", {"backbone.hidden_dim": 17}),
         ("n_rollouts", 9),
     ],
 )

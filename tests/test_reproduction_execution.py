@@ -211,7 +211,7 @@ def test_the_whole_suite_from_the_command(small_maze, tmp_path, run_command, cap
         "--steps=20",
         "--seeds=2",
         "--n_rollouts=6",
-        "--policy_options={hidden_dim: 16, num_hidden: 2}",
+        "--policy_options={backbone.hidden_dim: 16, backbone.num_hidden: 2}",
         f"--output_dir={tmp_path}",
         "--jobs=1",
     ]

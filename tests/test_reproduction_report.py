@@ -12,7 +12,7 @@ import pytest
 from lerobot_swr.cli.report import main as report_command
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.reproduction import contracting_tables
-from lerobot_swr.reproduction.cells import Cell, Store, write_text
+from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import (
     environment,
     load_low_dimensional,
@@ -27,6 +27,7 @@ from lerobot_swr.reproduction.settings import SUITES, ReproductionSettings
 from lerobot_swr.reproduction.stored_results import load_suites
 from lerobot_swr.reproduction.suites import suite_cells
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.whole_files import write_whole
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -101,7 +102,7 @@ def _finish(root: Path, small_maze: Path, monkeypatch: pytest.MonkeyPatch) -> No
             "datasets": {demos.name: store.result_path(demos.cell).name},
             "cells": [store.result_path(one).name for one in cells],
         }
-        write_text(store.root / "suites" / f"{suite}.json", json.dumps(manifest))
+        write_whole(store.root / "suites" / f"{suite}.json", json.dumps(manifest))
 
 
 def test_the_report_shows_every_suite_and_needs_no_other_file(drawn):
@@ -193,7 +194,7 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     target = tmp_path / "published"
     keep_only("table1", finished)
     write_results_report(finished)
-    write_text(target / "results" / "stale.json", "{}")
+    write_whole(target / "results" / "stale.json", "{}")
     publish([finished], target)
     assert not (target / "work").exists()
     assert not (target / "results" / "stale.json").exists()
@@ -232,7 +233,10 @@ def test_several_folders_are_published_as_one(finished, tmp_path, run_command):
     assert {c.policy for c in suite.evaluations("small_maze")} >= {"bc", "zbc", "wzbc"}
     assert all(c.training is not None for c in suite.evaluations("small_maze"))
     description = next((more / "results").glob("dataset-*.json"))
-    description.write_text(description.read_text().replace('"length":[', '"length":[1,'))
+    content = description.read_text().replace('"length":[', '"length":[1,')
+    renamed = description.with_name(f"{description.stem[:-12]}{'z' * 12}.json")
+    renamed.write_text(content)
+    manifest.write_text(manifest.read_text().replace(description.name, renamed.name))
     with pytest.raises(ValueError, match="results on different datasets called 'small_maze'"):
         publish([finished, more], target)
 

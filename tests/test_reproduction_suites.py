@@ -22,7 +22,7 @@ CONFIGS = Path(__file__).parent.parent / "configs"
 
 def test_names_tell_what_differs(settings, demos):
     """Numbers short, words as they are; options of the settings, too."""
-    differing = {"beta": 3.0, "corrective": "demos", "residual": False, "style_dim": 4}
+    differing = {"beta": 3.0, "corrective": "demos", "backbone.residual": False, "style_dim": 4}
     assert variant_name("wzbc", differing) == "wzbc beta=3 corrective=demos residual=False style_dim=4"
     assert training(settings, demos, "zbc").labels.policy == "zbc hidden_dim=16"
     both = training(settings, demos, "zbc", {"corrective": "demos"})

@@ -6,6 +6,8 @@ import pytest
 from lerobot_swr.evaluation.metrics import l1_floor
 from lerobot_swr.reproduction.style_geometry import input_distribution, teaching_shares
 from lerobot_swr.reproduction.summary import difference_interval, length_control, summarize
+from lerobot_swr.similarity import Dissimilarity
+from lerobot_swr.similarity.measure import DenseSimilarity
 
 DEMONSTRATED = ["a", "a", "b", "b"]
 
@@ -121,11 +123,10 @@ def test_input_distribution_by_hand():
 
 def test_teaching_shares_by_hand():
     """Three demonstrations, two of the same behaviour, p = .5."""
-    nu = np.array([[0.0, 0.2, 1.0], [0.2, 0.0, 1.0], [1.0, 1.0, 0.0]])
-    same = np.zeros((3, 3), dtype=bool)
-    same[0, 1] = same[1, 0] = True
+    distances = np.array([[0.0, 0.2, 1.0], [0.2, 0.0, 1.0], [1.0, 1.0, 0.0]])  # ν, as the farthest is at 1
+    dissimilarity = Dissimilarity(DenseSimilarity(distances), np.arange(3))
     near, far, beta = np.exp(-2 * 0.2) / 4, np.exp(-2.0) / 4, 2.0  # p W / (N - 1)
-    shares = teaching_shares(nu, same, beta, 0.5)
+    shares = teaching_shares(dissimilarity, np.array(["a", "a", "b"]), beta, 0.5)
     totals = [0.5 + near + far] * 2 + [0.5 + 2 * far]
     assert shares["own"] == pytest.approx(np.mean([0.5 / total for total in totals]))
     assert shares["same"] == pytest.approx(np.mean([near / totals[0], near / totals[1], 0]))
@@ -134,5 +135,6 @@ def test_teaching_shares_by_hand():
 
 def test_without_relabelling_a_style_is_taught_by_its_own_demonstration_alone():
     """p = 0 is ZBC."""
-    shares = teaching_shares(np.ones((4, 4)), np.zeros((4, 4), dtype=bool), 10.0, 0.0)
+    dissimilarity = Dissimilarity(DenseSimilarity(1 - np.eye(4)), np.arange(4))
+    shares = teaching_shares(dissimilarity, np.array(["a", "a", "b", "c"]), 10.0, 0.0)
     assert shares == {"own": 1.0, "same": 0.0, "other": 0.0}

@@ -23,7 +23,7 @@ SMALL = {
     | {"n_vae_encoder_layers": 1, "chunk_size": 4, "n_action_steps": 4},
     "diffusion": {"down_dims": [16, 32], "n_groups": 4, "horizon": 8, "diffusion_step_embed_dim": 8},
 }
-SMALL_NETWORK = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
+SMALL_NETWORK = ("--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2", "--log_freq=5")
 
 
 def small_run(policy_type: str, root: Path, output_dir: Path):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from lerobot_swr.sampling import NUMBERS_PER_BLOCK, SimilarityWeightedSampler, StepGenerator
-from lerobot_swr.similarity import normalize_distances
+from lerobot_swr.random_streams import NUMBERS_PER_BLOCK, StepGenerator
+from lerobot_swr.sampling import LARGEST_FACTOR, PartnerSampler
+from lerobot_swr.similarity.measure import DenseSimilarity
 
 N = 5
 DISTANCES = np.abs(np.subtract.outer(np.array([0.0, 1, 3, 7, 8]), np.array([0.0, 1, 3, 7, 8])))
@@ -19,18 +20,37 @@ def draw(sampler, episodes):
     return sampler.draw(episodes, uniforms.numpy() * (1 - 1e-9))
 
 
-def make_sampler(**options) -> SimilarityWeightedSampler:
-    sampler = SimilarityWeightedSampler(DISTANCES, **{"beta": 2.0, "p": 1.0, **options})
-    sampler.set_candidates(torch.ones(N, dtype=torch.bool))
-    return sampler
+def make_sampler(distances=DISTANCES, candidates=None, **options) -> PartnerSampler:
+    candidates = np.arange(len(distances)) if candidates is None else np.array(candidates)
+    options = {"beta": 2.0, "p": 1.0, "partner_sampling": "uniform", **options}
+    return PartnerSampler(DenseSimilarity(distances), candidates, **options)
+
+
+def exact_shares(distances, beta, p, normalization="row") -> np.ndarray:
+    """Algorithm 1: (N, N) 1 - p for j = i, and p W(i, j) / (N - 1) for j ≠ i."""
+    n = len(distances)
+    largest = distances.max(axis=1, keepdims=True) if normalization == "row" else distances.max()
+    shares = p * np.exp(-beta * distances / largest) / (n - 1)
+    shares[np.eye(n, dtype=bool)] = 1 - p
+    return shares
+
+
+def shares_of(sampler, n, grid=40_000) -> np.ndarray:
+    """(n, n) what the sampler gives each pair on average: all uniform numbers, at equal steps."""
+    numbers = (np.arange(grid) + 0.5) / grid
+    found = np.zeros((n, n))
+    for i in range(n):
+        pairs = sampler.draw(torch.full((grid,), i), numbers)
+        np.add.at(found[i], pairs.episodes.numpy(), pairs.weights.double().numpy() / grid)
+    return found
 
 
 def test_uniform_drawing_relabels_at_its_probability():
     """A relabelled frame has j ≠ i, another keeps j = i and weight 1; the share of the former is p."""
     GENERATOR.manual_seed(0)
     episodes = torch.arange(20_000) % N
-    pairs = draw(make_sampler(p=0.3, partner_sampling="uniform"), episodes)
-    assert ((pairs.styles != episodes) == pairs.relabelled).all()
+    pairs = draw(make_sampler(p=0.3), episodes)
+    assert ((pairs.episodes != episodes) == pairs.relabelled).all()
     assert (pairs.weights[~pairs.relabelled] == 1).all()
     assert abs(pairs.relabelled.float().mean() - 0.3) < 0.02
 
@@ -38,73 +58,137 @@ def test_uniform_drawing_relabels_at_its_probability():
 @pytest.mark.parametrize("p", [0.3, 0.8, 1.0])
 @pytest.mark.parametrize("normalization", ["row", "global"])
 def test_both_ways_of_drawing_have_the_expectation_of_algorithm_1(p, normalization):
-    """E[weight · f(i, j)] = (1 − p) f(i, i) + p · mean over j ≠ i of W(i, j) f(i, j)."""
-    GENERATOR.manual_seed(0)
-    values = torch.rand(N, N, generator=GENERATOR)
-    weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
-    draws = 100_000
-    for i in range(N):
-        others = [j for j in range(N) if j != i]
-        relabelled = np.mean([weights[i, j] * float(values[i, j]) for j in others])
-        expected = (1 - p) * float(values[i, i]) + p * relabelled
-        for way in ("uniform", "weighted"):
-            sampler = make_sampler(p=p, normalization=normalization, partner_sampling=way)
-            pairs = draw(sampler, torch.full((draws,), i))
-            samples = pairs.weights * values[i, pairs.styles]
-            assert abs(samples.mean() - expected) < 5 * samples.std() / np.sqrt(draws) + 1e-6
-        # Weighted drawing leaves the loss as the only source of variance: the weight is constant.
-        mass = (1 - p) + p * weights[i, others].mean()
-        torch.testing.assert_close(pairs.weights, torch.full((draws,), float(mass)))
+    """E[weight · 1(i, j)] is the pair's share, over all uniform numbers, for every pair."""
+    expected = exact_shares(DISTANCES, 2.0, p, normalization)
+    for way in ("uniform", "weighted"):
+        sampler = make_sampler(p=p, normalization=normalization, partner_sampling=way)
+        np.testing.assert_allclose(shares_of(sampler, N), expected, atol=1e-4)
+    # Weighted drawing leaves the loss as the only source of variance: the weight is constant.
+    pairs = draw(sampler, torch.arange(N).repeat(200))
+    np.testing.assert_allclose(pairs.weights, np.tile(expected.sum(axis=1), 200), rtol=1e-6)
 
 
 @pytest.mark.parametrize("normalization", ["row", "global"])
 def test_uniform_weights_equal_the_weight_matrix(normalization):
-    """Each pair's weight is W(i, j) = exp(−β ν(i, j)), computed here from the distances."""
+    """Each relabelled pair's weight is W(i, j) = exp(−β ν(i, j)), computed here from the distances."""
     GENERATOR.manual_seed(0)
-    weights = np.exp(-2.0 * normalize_distances(DISTANCES, normalization))
     episodes = torch.arange(500) % N
-    pairs = draw(make_sampler(normalization=normalization, partner_sampling="uniform"), episodes)
-    np.testing.assert_allclose(pairs.weights, weights[episodes, pairs.styles], rtol=1e-5)
+    pairs = draw(make_sampler(normalization=normalization), episodes)
+    weights = exact_shares(DISTANCES, 2.0, 1.0, normalization) * (N - 1)  # W, at p = 1, of pairs j ≠ i
+    np.testing.assert_allclose(pairs.weights, weights[episodes, pairs.episodes], rtol=1e-5)
+
+
+# --- More episodes than partners ---
+
+
+def clustered(n: int) -> np.ndarray:
+    """(n, n) distances of points in three clumps of a plane, some of which coincide."""
+    rng = np.random.default_rng(0)
+    points = rng.integers(3, size=(n, 1)) * np.array([3.0, 1.0]) + rng.normal(size=(n, 2)).round(1)
+    return np.linalg.norm(points[:, None] - points, axis=2)
+
+
+@pytest.mark.parametrize("beta", [0.0, 3.0, 30.0])
+@pytest.mark.parametrize("p", [0.8, 1.0])
+@pytest.mark.parametrize("partners", [1, 6, 28, 29, 60])
+def test_a_few_partners_and_the_rest_have_the_same_expectation(beta, p, partners):
+    """Every pair's share over all uniform numbers, whether its partner is among the nearest or not."""
+    distances = clustered(30)
+    sampler = make_sampler(distances, beta=beta, p=p, partner_sampling="weighted", partners=partners)
+    expected = exact_shares(distances, beta, p)
+    np.testing.assert_allclose(shares_of(sampler, 30), expected, atol=3e-4 * expected.sum(axis=1).max())
+
+
+def test_the_expectation_holds_in_random_draws():
+    """The mean of weight times a value of the pair, within its standard error; 100 episodes, 8 partners."""
+    GENERATOR.manual_seed(0)
+    distances, rng = clustered(100), np.random.default_rng(1)
+    values, episodes = rng.normal(size=(100, 100)), torch.from_numpy(rng.integers(100, size=200_000))
+    sampler = make_sampler(distances, beta=4.0, p=0.8, partner_sampling="weighted", partners=8)
+    pairs = draw(sampler, episodes)
+    found = pairs.weights.numpy() * values[episodes, pairs.episodes]
+    expected = (exact_shares(distances, 4.0, 0.8) * values).sum(axis=1)[episodes]
+    apart = found - expected
+    assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(len(apart))
+    nearest = np.argsort(distances + 1e9 * np.eye(100), axis=1, kind="stable")[:, :8]
+    is_near = (nearest[episodes] == pairs.episodes.numpy()[:, None]).any(axis=1)
+    assert 0.05 < is_near[pairs.relabelled].mean() < 0.95  # both ways of finding a partner took part
+
+
+def test_no_frame_of_the_rest_weighs_much_more_than_others():
+    """Also where similar episodes are too rare among the rest to have been noticed."""
+    n, partners = 2000, 5
+    distances = np.full((n, n), 10.0)
+    distances[:10, :10] = 1.0  # four episodes more than partners, among two thousand
+    np.fill_diagonal(distances, 0)
+    sampler = make_sampler(distances, beta=10.0, p=1.0, partner_sampling="weighted", partners=partners)
+    numbers = np.linspace(0, 1 - 1e-9, 200_001)
+    pairs = sampler.draw(torch.zeros(len(numbers), dtype=torch.int64), numbers)
+    within = pairs.weights[pairs.episodes < 10]
+    assert within.max() > 1.5 * within.min()  # the rare ones stand for more than their share
+    assert within.max() <= LARGEST_FACTOR * within.min() * (1 + 1e-5)
+    assert set(range(1, 10)) <= set(pairs.episodes.tolist())
+
+
+def test_what_a_sampler_holds_grows_with_the_partners_not_with_the_square_of_the_episodes():
+    """Its largest array is of about episodes times partners numbers."""
+    distances = clustered(600)
+    sampler = make_sampler(distances, partner_sampling="weighted", partners=10)
+    sizes = [value.size for value in vars(sampler).values() if isinstance(value, np.ndarray)]
+    assert max(sizes) == 600 * 12
+
+
+# --- Which episodes take part ---
 
 
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
 def test_without_temperature_every_weight_is_one(partner_sampling):
-    """β = 0 is BC-like: all demonstrations teach all styles alike."""
-    pairs = draw(make_sampler(beta=0.0, partner_sampling=partner_sampling), torch.arange(1000) % N)
-    torch.testing.assert_close(pairs.weights, torch.ones(1000))
+    """β = 0 is BC-like: all demonstrations teach all styles alike, partners or not."""
+    for partners in (2, 256):
+        sampler = make_sampler(beta=0.0, partner_sampling=partner_sampling, partners=partners)
+        torch.testing.assert_close(draw(sampler, torch.arange(1000) % N).weights, torch.ones(1000))
 
 
+@pytest.mark.parametrize("partners", [1, 256])
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
-def test_only_candidates_are_drawn_and_normalise(partner_sampling):
+def test_only_candidates_are_drawn_and_normalise(partner_sampling, partners):
     """Episodes outside the training data are no partners, and the farthest candidate is at ν = 1."""
     GENERATOR.manual_seed(0)
-    sampler = make_sampler(partner_sampling=partner_sampling)
-    sampler.set_candidates(torch.tensor([1, 0, 1, 1, 0]))
+    sampler = make_sampler(candidates=[0, 2, 3], partner_sampling=partner_sampling, partners=partners)
     pairs = draw(sampler, torch.tensor([0, 2, 3]).repeat(300))
-    assert set(pairs.styles.tolist()) == {0, 2, 3}
+    assert set(pairs.episodes.tolist()) == {0, 2, 3}
     assert float(sampler.nu(np.array(0), np.array(3))) == 1.0
 
 
+def test_frames_of_other_episodes_are_refused():
+    """They have no style to teach; the message names them."""
+    with pytest.raises(ValueError, match=r"episodes \[1, 4\] are not among the 3"):
+        draw(make_sampler(candidates=[0, 2, 3]), torch.tensor([0, 4, 1]))
+
+
+@pytest.mark.parametrize("partners", [2, 256])
 @pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
-def test_a_huge_temperature_gives_zero_weights_and_no_nan(partner_sampling):
+def test_a_huge_temperature_gives_zero_weights_and_no_nan(partner_sampling, partners):
     """β where exp(−β) underflows leaves relabelled frames with weight 0, not with NaN."""
-    pairs = draw(make_sampler(beta=1e6, partner_sampling=partner_sampling), torch.arange(50) % N)
-    assert (pairs.weights == 0).all()
+    sampler = make_sampler(beta=1e6, partner_sampling=partner_sampling, partners=partners)
+    assert (draw(sampler, torch.arange(50) % N).weights == 0).all()
 
 
-def test_a_single_candidate_keeps_its_frames():
+@pytest.mark.parametrize("partner_sampling", ["uniform", "weighted"])
+def test_a_single_candidate_keeps_its_frames(partner_sampling):
     """With nobody else to teach, frames keep their own style."""
-    sampler = make_sampler()
-    sampler.set_candidates(torch.tensor([0, 1, 0, 0, 0]))
-    pairs = draw(sampler, torch.tensor([1, 1]))
-    assert pairs.styles.tolist() == [1, 1]
+    pairs = draw(make_sampler(candidates=[1], partner_sampling=partner_sampling), torch.tensor([1, 1]))
+    assert pairs.episodes.tolist() == [1, 1]
     assert not pairs.relabelled.any()
 
 
 def test_effective_demos_run_from_one_to_all():
-    """All demonstrations teach a style at β = 0, its own alone at β → ∞."""
+    """All demonstrations teach a style at β = 0, its own alone at β → ∞; between, Kish's formula."""
     assert make_sampler(beta=0.0).effective_demos == pytest.approx(N)
     assert make_sampler(beta=1e6).effective_demos == pytest.approx(1)
+    w = exact_shares(DISTANCES, 2.0, 1.0) * (N - 1) + np.eye(N)
+    expected = (w.sum(axis=0) ** 2 / (w**2).sum(axis=0)).mean()
+    assert make_sampler(beta=2.0).effective_demos == pytest.approx(expected, rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -121,6 +205,9 @@ def test_bad_options_are_named(options, message):
     """The error names key and value."""
     with pytest.raises(ValueError, match=message):
         make_sampler(**options)
+
+
+# --- Random numbers ---
 
 
 def test_random_numbers_are_a_function_of_the_step():

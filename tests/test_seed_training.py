@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import SMALL_MAZE, make_batch, train_flags
+from conftest import OBSERVATIONS, SMALL_MAZE, make_batch, train_flags
 from lerobot.configs import PreTrainedConfig
 from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import EpisodeAwareSampler
@@ -19,6 +19,7 @@ from lerobot_swr.cli import train as train_command
 from lerobot_swr.corrective.inverse_model import fit_inverse_model
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 from lerobot_swr.training import early_updates
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
@@ -26,7 +27,7 @@ from lerobot_swr.training.seed_runs import SeedRuns
 from lerobot_swr.training.stacked_policies import StackedPolicies
 from lerobot_swr.training.traced_gradients import TracedGradients
 
-SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2", "--log_freq=5")
+SMALL = ("--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2", "--log_freq=5")
 
 
 def weights(run: Path, step: int) -> dict[str, torch.Tensor]:
@@ -50,9 +51,20 @@ def test_frames_come_in_lerobots_order():
     assert order.steps(3, 5).shape == (1, 4)
 
 
+def stack_lessons(lessons):
+    """Their tensors, (K, B, ...), as training stacks them."""
+    parts = [lesson.tensors([*OBSERVATIONS, "action"]) for lesson in lessons]
+    return {key: torch.stack([part[key] for part in parts]) for key in parts[0]}
+
+
 @pytest.mark.parametrize(
     ("policy_type", "options"),
-    [("bc", {}), ("zbc", {}), ("wzbc", {}), ("wzbc", {"partner_sampling": "uniform", "residual": False})],
+    [
+        ("bc", {}),
+        ("zbc", {}),
+        ("wzbc", {}),
+        ("wzbc", {"partner_sampling": "uniform", "backbone": MLPConfig(16, 3, residual=False)}),
+    ],
 )
 def test_losses_and_gradients_are_those_of_a_single_policy(make_tiny_policy, policy_type, options):
     """On the same batch and partners, parameter by parameter."""
@@ -61,10 +73,10 @@ def test_losses_and_gradients_are_those_of_a_single_policy(make_tiny_policy, pol
     drawn = [policy.draw(make_batch(seed=k)) for k, policy in enumerate(policies)]
     config = type("Run", (), {"optimizer": policies[0].config.get_optimizer_preset(), "scheduler": None})()
     stack = StackedPolicies(policies, optimizers, None, config)
-    stacked = {key: torch.stack([one[key] for one in drawn]) for key in drawn[0]}
+    stacked = stack_lessons(drawn)
     losses, gradients = stack.losses_and_gradients(stacked)
     for k, policy in enumerate(policies):
-        loss = policy.frame_losses(drawn[k]).mean()
+        loss = policy.loss(drawn[k])[0]
         loss.backward()
         torch.testing.assert_close(losses[k], loss)
         for name, parameter in policy.named_parameters():
@@ -102,14 +114,14 @@ def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
     """A large gradient of one policy is cut to the limit and leaves the other policy's alone."""
     policies = [make_tiny_policy("zbc", seed=seed, optimizer_grad_clip_norm=1.0).train() for seed in range(2)]
     drawn = [policy.draw(make_batch(seed=k)) for k, policy in enumerate(policies)]
-    drawn[0]["weight"] *= 0.1
-    drawn[1]["weight"] *= 1000
+    drawn[0].weight.mul_(0.1)
+    drawn[1].weight.mul_(1000)
     optimizers = [p.config.get_optimizer_preset().build(p.get_optim_params()) for p in policies]
     config = type("Run", (), {"optimizer": policies[0].config.get_optimizer_preset(), "scheduler": None})()
     stack = StackedPolicies(policies, optimizers, None, config)
-    stack.step({key: torch.stack([one[key] for one in drawn]) for key in drawn[0]})
+    stack.step(stack_lessons(drawn))
     for policy, optimizer, one in zip(policies, optimizers, drawn, strict=True):
-        policy.frame_losses(one).mean().backward()
+        policy.loss(one)[0].backward()
         norm = torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
         assert (norm > 1) == (one is drawn[1])
         optimizer.step()
@@ -125,14 +137,15 @@ def test_gradients_are_clipped_policy_by_policy(make_tiny_policy):
     [("bc", ()), ("zbc", ()), ("wzbc", ()), ("wzbc", ("--policy.corrective=demos",))],
 )
 def test_a_seed_is_trained_as_lerobot_train_does(
-    monkeypatch, lerobot_train_command, swr_train, small_maze, tmp_path, policy_type, options
+    monkeypatch, swr_train, small_maze, tmp_path, policy_type, options
 ):
-    """Same initial weights, frames, pairs and updates over more than an epoch; equal up to rounding."""
+    """Beside LeRobot's own loop: same initial weights, frames, pairs and updates over more than an epoch."""
     monkeypatch.setattr(early_updates, "SMALL", 1)  # networks of a usual size are updated early
     flags = [*SMALL, *options, "--policy.flush_denormal=false"]
-    lerobot_train_command(*train_flags(policy_type, small_maze, tmp_path / "one", 70, *flags, "--seed=3"))
+    alone = ("--stack=false", "--seeds=3", "--jobs=1")
+    swr_train(*train_flags(policy_type, small_maze, tmp_path / "one", 70, *flags, *alone))
     swr_train(*train_flags(policy_type, small_maze, tmp_path / "all", 70, *flags, "--seeds=1,3", "--jobs=1"))
-    expected, found = weights(tmp_path / "one", 70), weights(tmp_path / "all" / "seed_3", 70)
+    expected, found = weights(tmp_path / "one" / "seed_3", 70), weights(tmp_path / "all" / "seed_3", 70)
     assert expected.keys() == found.keys()
     for name, value in expected.items():
         torch.testing.assert_close(found[name], value, rtol=1e-3, atol=1e-5, msg=name)
@@ -190,7 +203,9 @@ def test_the_dynamics_are_those_of_the_runs_episodes(small_maze, small_maze_meta
     """Whatever the flags of the program mean that trains seeds from Python."""
     monkeypatch.setattr("sys.argv", ["program", "--dataset.episodes=[0,2]"])
     dataset = DatasetConfig("local/small_maze", root=str(small_maze), episodes=[1, 4, 5])
-    policy = make_policy_config("zbc", device="cpu", push_to_hub=False, hidden_dim=16, corrective="noise")
+    policy = make_policy_config(
+        "zbc", device="cpu", push_to_hub=False, backbone=MLPConfig(16), corrective="noise"
+    )
     config = SeedsTrainConfig(dataset, policy=policy, output_dir=tmp_path / "run", seeds=[0], jobs=1)
     config.validate()
     (made,) = SeedRuns(config, [0], small_maze_meta).policies
@@ -282,7 +297,7 @@ def test_a_command_that_failed_at_its_start_can_be_corrected(swr_train, small_ma
     """No checkpoint was written, so other options are welcome in the same folder."""
     flags = train_flags("wzbc", small_maze, tmp_path / "run", 4, *SMALL, "--seeds=0", "--jobs=1")
     with pytest.raises(SystemExit):
-        swr_train(*flags, '--policy.similarity_keys=["observation.speed"]')
+        swr_train(*flags, '--policy.data.similarity_keys=["observation.speed"]')
     assert "observation.speed" in capfd.readouterr().err
     swr_train(*flags)
     assert weights(tmp_path / "run/seed_0", 4)

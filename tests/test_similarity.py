@@ -1,26 +1,15 @@
-"""Dissimilarities, weights and their cache."""
-
-import logging
-from concurrent.futures import ThreadPoolExecutor
+"""Dissimilarities and weights by their definition, and who answers for few episodes."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from lerobot.datasets import LeRobotDatasetMetadata
 
-from lerobot_swr import similarity
-from lerobot_swr.similarity import (
-    CACHE_FOLDER,
-    cached_distances,
-    dissimilarity_matrix,
-    pairwise_distances,
-    similarity_weights,
-)
-from lerobot_swr.trajectories import Trajectories, load_trajectories
-
-KEYS = ["observation.state"]
+from lerobot_swr.similarity import Dissimilarity, distances, similarity_of, similarity_weights
+from lerobot_swr.similarity.distances import pairwise_distances
+from lerobot_swr.similarity.measure import DenseSimilarity
+from lerobot_swr.trajectories import Trajectories
 
 
 def oracle_distances(states: list[np.ndarray]) -> np.ndarray:
@@ -38,6 +27,13 @@ def oracle_distances(states: list[np.ndarray]) -> np.ndarray:
 def random_states(seed: int, lengths: list[int], dim: int = 3) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     return [rng.normal(size=(length, dim)).astype(np.float32) for length in lengths]
+
+
+def nu_matrix(states: list[np.ndarray], normalization: str = "row") -> np.ndarray:
+    """ν of all pairs, as callers ask for it."""
+    everyone = np.arange(len(states))
+    similarity = DenseSimilarity(pairwise_distances(states))
+    return Dissimilarity(similarity, everyone, normalization).nu(everyone[:, None], everyone)
 
 
 episodes = st.lists(
@@ -66,16 +62,16 @@ def test_blocks_of_time_do_not_change_the_result(monkeypatch):
     """The blocked computation gives what one block gives."""
     states = random_states(2, [30, 11, 23, 4])
     whole = pairwise_distances(states)
-    monkeypatch.setattr(similarity, "BLOCK_ELEMENTS", 4 * 3 * 7)
+    monkeypatch.setattr(distances, "BLOCK_ELEMENTS", 4 * 3 * 7)
     np.testing.assert_allclose(pairwise_distances(states), whole, rtol=1e-12)
 
 
 def test_row_normalization_follows_the_paper():
     """ν(i, j) = d(i, j) / max_k d(i, k), hence not symmetric."""
     states = random_states(3, [4, 6, 5])
-    distances = oracle_distances(states)
-    expected = [[distances[i, j] / max(distances[i]) for j in range(3)] for i in range(3)]
-    nu = dissimilarity_matrix(states, "row")
+    apart = oracle_distances(states)
+    expected = [[apart[i, j] / max(apart[i]) for j in range(3)] for i in range(3)]
+    nu = nu_matrix(states)
     np.testing.assert_allclose(nu, expected, rtol=1e-12)
     assert not np.allclose(nu, nu.T)
 
@@ -84,7 +80,7 @@ def test_row_normalization_follows_the_paper():
 @given(episodes)
 def test_dissimilarities_are_bounded_and_zero_on_the_diagonal(states):
     """For any episodes: 0 on the diagonal, in [0, 1], never NaN; symmetric under global normalisation."""
-    row, whole = dissimilarity_matrix(states, "row"), dissimilarity_matrix(states, "global")
+    row, whole = nu_matrix(states), nu_matrix(states, "global")
     for nu in (row, whole):
         assert (np.diag(nu) == 0).all()
         assert ((nu >= 0) & (nu <= 1)).all()
@@ -96,16 +92,24 @@ def test_dissimilarities_are_bounded_and_zero_on_the_diagonal(states):
 def test_duplicate_episodes_have_distance_zero_and_identical_datasets_no_nan():
     """Equal episodes are at distance exactly 0, also when all are equal or there is only one."""
     a, b = random_states(4, [7, 9])
-    distances = pairwise_distances([a, b, a])
-    assert distances[0, 2] == 0
-    assert distances[0, 1] > 0
-    assert (dissimilarity_matrix([a, a, a]) == 0).all()
-    assert dissimilarity_matrix([a]).tolist() == [[0.0]]
+    apart = pairwise_distances([a, b, a])
+    assert apart[0, 2] == 0
+    assert apart[0, 1] > 0
+    assert (nu_matrix([a, a, a]) == 0).all()
+    assert nu_matrix([a]).tolist() == [[0.0]]
+
+
+def test_only_candidates_normalise():
+    """The farthest candidate is at ν = 1, whoever is farther; globally the farthest pair of candidates."""
+    line = DenseSimilarity(np.abs(np.subtract.outer([0.0, 1, 3, 7], [0.0, 1, 3, 7])))
+    some = np.array([0, 1, 2])
+    assert Dissimilarity(line, some).nu(np.array([0, 1]), np.array([2, 2])).tolist() == [1.0, 1.0]
+    assert Dissimilarity(line, some, "global").nu(np.array([0, 1]), np.array([2, 2])).tolist() == [1, 2 / 3]
 
 
 def test_weights_are_one_without_temperature_and_an_indicator_for_a_large_one():
     """β = 0 treats all demonstrations alike; β → ∞ leaves each to itself."""
-    nu = dissimilarity_matrix(random_states(5, [4, 4, 4]))
+    nu = nu_matrix(random_states(5, [4, 4, 4]))
     assert (similarity_weights(nu, 0.0) == 1).all()
     np.testing.assert_allclose(similarity_weights(nu, 1e6), np.eye(3), atol=1e-12)
     np.testing.assert_allclose(similarity_weights(np.array([0.5]), 10.0), [np.exp(-5.0)])
@@ -122,69 +126,40 @@ def test_bad_states_are_named():
     """NaN, empty episodes, other dimensions and unknown normalisations are refused by name."""
     good = np.zeros((3, 2))
     with pytest.raises(ValueError, match=r"states\[1\] holds NaN"):
-        dissimilarity_matrix([good, np.full((2, 2), np.nan)])
+        pairwise_distances([good, np.full((2, 2), np.nan)])
     with pytest.raises(ValueError, match=r"states\[1\] has shape \(0, 2\)"):
-        dissimilarity_matrix([good, np.zeros((0, 2))])
+        pairwise_distances([good, np.zeros((0, 2))])
     with pytest.raises(ValueError, match=r"states\[1\] has shape \(3, 5\)"):
-        dissimilarity_matrix([good, np.zeros((3, 5))])
+        pairwise_distances([good, np.zeros((3, 5))])
     with pytest.raises(ValueError, match="normalization='column'"):
-        dissimilarity_matrix([good], "column")  # type: ignore[arg-type]
+        nu_matrix([good], "column")
 
 
-# --- cache ---
+# --- Few episodes ---
 
 
-@pytest.fixture
-def trajectories(small_maze_meta: LeRobotDatasetMetadata) -> Trajectories:
-    return load_trajectories(small_maze_meta, KEYS)
+def test_the_nearest_come_by_distance_then_by_number_and_never_are_the_episode_itself():
+    """Ties and duplicates on a line; among all, among some, and of an episode that is no candidate."""
+    places = np.array([0.0, 2, 1, -1, 0])
+    similarity = DenseSimilarity(np.abs(np.subtract.outer(places, places)))
+    everyone = np.arange(5)
+    found, apart = similarity.nearest(everyone, 3, everyone)
+    assert found.tolist() == [[4, 2, 3], [2, 0, 4], [0, 1, 4], [0, 4, 2], [0, 2, 3]]
+    assert apart.tolist() == [[0, 1, 1], [1, 2, 2], [1, 1, 1], [1, 1, 2], [0, 1, 1]]
+    found, _ = similarity.nearest(np.array([0, 3]), 9, np.array([1, 2, 4]))
+    assert found.tolist() == [[4, 2, 1], [4, 2, 1]]
+    found, _ = similarity.nearest(np.array([2, 0]), 9, np.array([1, 2, 4]))
+    assert found.tolist() == [[1, 4], [4, 2]]  # as many as each of them has
+    assert similarity.farthest(np.array([1, 2])).tolist() == [2, 1, 1, 3, 2]
+    assert similarity.nearest(np.array([1]), 2, np.array([1]))[0].shape == (1, 0)
 
 
-def test_the_cache_is_used_when_intact(trajectories, tmp_path, monkeypatch):
-    """The second call reads the file instead of computing."""
-    first = cached_distances(trajectories, KEYS, tmp_path)
-    monkeypatch.setattr(similarity, "pairwise_distances", lambda states: pytest.fail("computed again"))
-    np.testing.assert_array_equal(cached_distances(trajectories, KEYS, tmp_path), first)
-
-
-@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped"])
-def test_a_damaged_cache_is_computed_anew(trajectories, tmp_path, damage, caplog):
-    """A half-written or altered file is not trusted, and is replaced."""
-    expected = cached_distances(trajectories, KEYS, tmp_path)
-    (file,) = (tmp_path / CACHE_FOLDER).iterdir()
-    content = bytearray(file.read_bytes())
-    if damage == "flipped":
-        content[-3] ^= 0xFF
-    file.write_bytes({"truncated": content[: len(content) // 2], "empty": b"", "flipped": content}[damage])
-    with caplog.at_level(logging.WARNING):
-        np.testing.assert_array_equal(cached_distances(trajectories, KEYS, tmp_path), expected)
-    assert "computed anew" in caplog.text
-    caplog.clear()
-    cached_distances(trajectories, KEYS, tmp_path)
-    assert not caplog.text
-
-
-def test_changed_states_meet_another_cache(trajectories, tmp_path):
-    """The key is the content, so an edited dataset never meets a stale cache."""
-    before = cached_distances(trajectories, KEYS, tmp_path)
-    trajectories.columns["observation.state"][0, 0] += 0.5
-    assert not np.array_equal(cached_distances(trajectories, KEYS, tmp_path), before)
-    assert len(list((tmp_path / CACHE_FOLDER).iterdir())) == 2
-
-
-def test_a_dataset_that_may_not_be_written_is_left_alone(trajectories, tmp_path, monkeypatch):
-    """The cache goes to LeRobot's home where the dataset's folder is read-only."""
-    home, dataset = tmp_path / "home", tmp_path / "dataset"
-    dataset.mkdir(mode=0o555)
-    monkeypatch.setattr(similarity, "HF_LEROBOT_HOME", home)
-    cached_distances(trajectories, KEYS, dataset)
-    assert list(dataset.iterdir()) == []
-    assert len(list((home / CACHE_FOLDER).iterdir())) == 1
-
-
-def test_several_may_race_for_the_cache(trajectories, tmp_path):
-    """Writers at the same time agree and leave one intact file, no temporary ones."""
-    with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(lambda _: cached_distances(trajectories, KEYS, tmp_path), range(8)))
-    for result in results:
-        np.testing.assert_array_equal(result, results[0])
-    assert [file.suffix for file in (tmp_path / CACHE_FOLDER).iterdir()] == [".safetensors"]
+def test_features_are_compared_side_by_side(tmp_path):
+    """Distances over two features are the root of the sum of the squares over each."""
+    states, other = random_states(6, [4, 6, 5]), random_states(7, [4, 6, 5], dim=2)
+    columns = {"a": np.concatenate(states), "b": np.concatenate(other)}
+    trajectories = Trajectories(np.array([4, 6, 5]), columns, 10, "made up")
+    i, j = np.arange(3)[:, None], np.arange(3)
+    expected = np.hypot(oracle_distances(states), oracle_distances(other))
+    np.testing.assert_allclose(similarity_of(trajectories, ["a", "b"], tmp_path).distance(i, j), expected)
+    assert list(tmp_path.iterdir()) == []  # computed in a moment, so not kept

@@ -12,8 +12,8 @@ import torch
 from conftest import make_batch, save_checkpoint
 
 from lerobot_swr.cli import styles as styles_command
-from lerobot_swr.style_map import as_script, demonstration_paths, principal_components, write_style_map
-from lerobot_swr.style_table import StyleTable
+from lerobot_swr.styles.map import as_script, demonstration_paths, principal_components, write_style_map
+from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import load_trajectories
 
 

@@ -10,7 +10,7 @@ from conftest import make_batch, save_checkpoint, train_flags
 from draccus.utils import ParsingError
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
-from lerobot.policies import make_policy
+from lerobot.policies import PreTrainedPolicy, make_policy
 
 from lerobot_swr.behaviors import dataset_behavior_rule
 from lerobot_swr.cli import styles as styles_command
@@ -18,9 +18,9 @@ from lerobot_swr.demos.catalog import RECIPES
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
-from lerobot_swr.similarity import dissimilarity_matrix
-from lerobot_swr.style_selection import StyleSelection
-from lerobot_swr.style_table import StyleTable, load_style_table, make_style_table
+from lerobot_swr.similarity.distances import pairwise_distances
+from lerobot_swr.styles.selection import StyleSelection
+from lerobot_swr.styles.table import TABLE_FILE, StyleTable, load_style_table, make_style_table
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 
@@ -50,9 +50,9 @@ def table() -> StyleTable:
         "next.success": np.array([0, 0, 1, 0, 0, 0, 0, 0, 1, 0], dtype=np.float32)[:, None],
     }
     trajectories = Trajectories(lengths, columns, fps=2, name="line", tasks=("a", "a", "b", "b"))
-    distances = np.abs(np.subtract.outer([0.0, 1.0, 5.0, 4.0], [0.0, 1.0, 5.0, 4.0]))
+    neighbours = np.array([[1, 3, 2], [0, 3, 2], [3, 1, 0], [2, 1, 0]])
     return make_style_table(
-        trajectories, distances, lambda e: "far" if e["observation.state"][-1, 0] > 4 else "near"
+        trajectories, neighbours, lambda e: "far" if e["observation.state"][-1, 0] > 4 else "near"
     )
 
 
@@ -71,17 +71,56 @@ def test_columns_are_what_their_names_say(table):
         "task": ["a", "a", "b", "b"],
         "behavior": ["near", "near", "far", "far"],
     }
-    assert table.neighbours == [[1, 3, 2], [0, 3, 2], [3, 1, 0], [2, 1, 0]]
 
 
 def test_neighbours_are_nearest_by_nu(small_maze_meta, make_tiny_policy):
-    """The order is that of ν as the similarity module computes it."""
+    """The order is that of the distances as they are defined; the neighbours are all others."""
     table = make_tiny_policy("zbc").styles.table
     keys = ["observation.environment_state", "observation.state"]
-    nu = dissimilarity_matrix(load_trajectories(small_maze_meta, keys).states(keys))
-    for i, neighbours in enumerate(table.neighbours):
+    distances = pairwise_distances(load_trajectories(small_maze_meta, keys).states(keys))
+    for i, neighbours in enumerate(table.neighbours.tolist()):
         assert sorted(neighbours) == [j for j in range(6) if j != i]
-        assert (np.diff(nu[i, neighbours]) >= -1e-12).all()
+        assert (np.diff(distances[i, neighbours]) >= -1e-12).all()
+
+
+def test_a_saved_table_comes_back_as_it_was(table, tmp_path):
+    """Kinds of columns, neighbours and filters; of one demonstration alone, too; no other file is left."""
+    named = table.with_filter("näher", "behavior == 'near'")
+    alone = StyleTable({name: values[:1] for name, values in table.columns.items()}, np.empty((1, 0)))
+    for one in (named, alone):
+        one.save(tmp_path)
+        found = load_style_table(tmp_path)
+        assert found.columns == one.columns
+        assert [type(values[0]) for values in found.columns.values()] == [
+            type(values[0]) for values in one.columns.values()
+        ]
+        np.testing.assert_array_equal(found.neighbours, one.neighbours)
+        assert found.filters == one.filters
+        assert [path.name for path in tmp_path.iterdir()] == [TABLE_FILE]
+
+
+def test_the_table_is_pushed_to_the_hub_before_the_policy(checkpoint, monkeypatch):
+    """LeRobot uploads no parquet files, and a remote run ends when it says that the policy is there."""
+    policy, pushed = reload(checkpoint), []
+    policy.config.repo_id = "user/policy"
+
+    def keep(api, path_or_fileobj, path_in_repo, repo_id):
+        pushed.append((repo_id, path_in_repo, path_or_fileobj.read_bytes()))
+
+    monkeypatch.setattr("huggingface_hub.HfApi.create_repo", lambda api, **_: None)
+    monkeypatch.setattr("huggingface_hub.HfApi.upload_file", keep)
+    monkeypatch.setattr(PreTrainedPolicy, "push_model_to_hub", lambda *_, **__: pushed.append("policy"))
+    policy.push_model_to_hub(None)
+    assert pushed == [("user/policy", TABLE_FILE, (checkpoint / TABLE_FILE).read_bytes()), "policy"]
+
+
+def test_missing_neighbours_are_nobodys(table):
+    """Rows that were added later may have more neighbours than those before them."""
+    more = StyleTable({name: values[:1] for name, values in table.columns.items()}, np.array([[2, 0, 1, 3]]))
+    both = table.extended(more)
+    assert both.neighbours.tolist() == [*([*row, -1] for row in table.neighbours.tolist()), [2, 0, 1, 3]]
+    trained = np.ones(5, dtype=bool)
+    assert StyleSelection(like=0, neighbours=9).resolve(trained, both) == [0, 1, 3, 2]
 
 
 def test_a_selection_keeps_what_all_conditions_allow(table):
@@ -152,7 +191,10 @@ def test_the_table_travels_with_the_checkpoint_and_flags_select_styles(checkpoin
     assert drawn(policy) == set(range(6))
     assert drawn(reload(checkpoint, style_filter="behavior == '10'")) == left
     assert drawn(reload(checkpoint, style_episodes="[3,1]")) == {1, 3}
-    assert drawn(reload(checkpoint, style_like=2, style_neighbours=2)) == {2, *table.neighbours[2][:2]}
+    assert drawn(reload(checkpoint, style_like=2, style_neighbours=2)) == {
+        2,
+        *table.neighbours[2, :2].tolist(),
+    }
     assert policy.styles.filter("behavior == '10'") == sorted(left)
     policy.styles.select([4])
     assert drawn(policy) == {4}
@@ -214,7 +256,7 @@ def test_an_older_checkpoint_loads_without_its_table_and_gets_one_by_command(
     checkpoint, small_maze, run_command, caplog, capsys
 ):
     """A message tells the command; after it filters work."""
-    (checkpoint / "styles.json").unlink()
+    (checkpoint / TABLE_FILE).unlink()
     with caplog.at_level(logging.WARNING):
         policy = reload(checkpoint)
     assert "no table of its demonstrations" in caplog.text
@@ -246,7 +288,7 @@ def test_a_table_made_anew_leaves_the_facts_of_training_alone(
     assert json.loads((folder / "config.json").read_text()) == {**known, "style_metrics": metric}
     new = load_style_table(folder)
     assert new.columns == {**policy.styles.table.columns, "last_y": new.columns["last_1"]}
-    assert new.neighbours == policy.styles.table.neighbours
+    np.testing.assert_array_equal(new.neighbours, policy.styles.table.neighbours)
 
 
 def test_filters_are_previewed_named_listed_and_forgotten_by_command(checkpoint, run_command, capsys):
@@ -298,11 +340,13 @@ def test_bad_metrics_and_damaged_tables_are_named(make_tiny_policy, checkpoint):
         make_tiny_policy("zbc", style_metrics=f"{__name__}:failing")
     with pytest.raises(ValueError, match="style_metrics='nowhere:metric'"):
         make_tiny_policy("zbc", style_metrics="nowhere:metric")
-    content = (checkpoint / "styles.json").read_text()
-    (checkpoint / "styles.json").write_text(content[:100])
-    with pytest.raises(ValueError, match="damaged table"):
-        reload(checkpoint)
-    (checkpoint / "styles.json").write_text(json.dumps({**json.loads(content), "neighbours": [[]]}))
+    table, content = load_style_table(checkpoint), (checkpoint / TABLE_FILE).read_bytes()
+    for damaged in (content[:100], content[:-20], b"", b"{}"):
+        (checkpoint / TABLE_FILE).write_bytes(damaged)
+        with pytest.raises(ValueError, match="damaged table"):
+            reload(checkpoint)
+    columns = {name: values[:1] for name, values in table.columns.items()}
+    StyleTable(columns, table.neighbours[:1]).save(checkpoint)
     with pytest.raises(ValueError, match="1 rows, the checkpoint 6 styles"):
         reload(checkpoint)
 

@@ -5,14 +5,15 @@ from collections import Counter
 import pytest
 import torch
 
-from lerobot_swr.style_selection import StyleSelection
-from lerobot_swr.styles import StyleCookbook
+from lerobot_swr.styles.cookbook import BLENDED, StyleCookbook
+from lerobot_swr.styles.request import StyleRequest
+from lerobot_swr.styles.selection import StyleSelection
 
 
 def make_cookbook(trained=(0, 1, 2, 3, 4, 5), **options) -> StyleCookbook:
     torch.manual_seed(0)
     cookbook = StyleCookbook(6, style_dim=3, init_scale=0.1, **options)
-    cookbook.mark_trained(torch.tensor(list(trained), dtype=torch.long))
+    cookbook.trained[list(trained)] = 1
     return cookbook
 
 
@@ -79,3 +80,33 @@ def test_untrained_styles_cannot_be_selected():
         make_cookbook(trained=[0, 1], selection=StyleSelection(episodes=[1, 3])).draw(1)
     with pytest.raises(ValueError, match="no style has been trained"):
         make_cookbook(trained=[]).draw(1)
+
+
+def test_a_request_is_served_in_order_and_then_forgotten():
+    """Over and over, whatever the sampling and the selection, rollout by rollout."""
+    cookbook = make_cookbook(trained=[0, 2, 5])
+    with cookbook.requested(StyleRequest([5, 0])):
+        drawn = []
+        for _ in range(2):
+            cookbook.end_rollout()
+            style = cookbook.active_styles(3)
+            drawn.append(cookbook.active.tolist())
+            torch.testing.assert_close(style, cookbook.embedding(cookbook.active))
+    assert drawn == [[5, 0, 5], [0, 5, 0]]
+    assert cookbook.request is None
+    with pytest.raises(ValueError, match=r"episodes \[1\] were not in the training data"):
+        cookbook.requested(StyleRequest([1])).__enter__()
+
+
+def test_styles_that_are_no_episodes_can_be_requested():
+    """As vectors; who looks at the active episodes finds that there are none."""
+    cookbook, vectors = make_cookbook(trained=[0]), torch.randn(2, 3)
+    with cookbook.requested(StyleRequest(vectors=vectors)):
+        cookbook.end_rollout()
+        assert torch.equal(cookbook.active_styles(3), vectors[[0, 1, 0]])
+        assert torch.equal(cookbook.active_styles(3), vectors[[0, 1, 0]])
+    assert cookbook.active.tolist() == [BLENDED] * 3
+    with pytest.raises(ValueError, match="one of the two"):
+        StyleRequest([1], vectors)
+    with pytest.raises(ValueError, match="empty request"):
+        StyleRequest([])

@@ -18,7 +18,7 @@ from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file
 from training_command import forget_after
 
-SMALL = ("--policy.hidden_dim=16", "--policy.num_hidden=2")
+SMALL = ("--policy.backbone.type=mlp", "--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2")
 
 
 def weights(output_dir: Path, step: int) -> dict[str, torch.Tensor]:
@@ -131,7 +131,7 @@ def test_resuming_on_another_dataset_is_refused(lerobot_train_command, small_maz
 def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_command, small_maze, tmp_path):
     """The flag set of docs/method.md trains."""
     flags = [
-        "--policy.residual=false",
+        "--policy.backbone.residual=false",
         "--policy.lr_schedule=constant",
         "--policy.style_init_scale=1.0",
         "--policy.style_lr_scale=1.0",
@@ -139,7 +139,7 @@ def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_co
         '--policy.normalization_mapping={"STATE": "IDENTITY", "ENV": "IDENTITY", "ACTION": "IDENTITY"}',
     ]
     lerobot_train_command(*train_flags("wzbc", small_maze, tmp_path / "run", 2, *flags))
-    assert not load(tmp_path / "run").config.residual
+    assert not load(tmp_path / "run").config.backbone.residual
 
 
 @pytest.mark.parametrize(
@@ -149,6 +149,11 @@ def test_the_papers_literal_flags_are_understood_by_the_command(lerobot_train_co
         (("--policy.beta=-1",), "beta=-1"),
         (("--policy.style_sampling=some",), "style_sampling='some'"),
         (("--dataset.root=nowhere",), "dataset.root='nowhere': no such folder"),
+        (("--policy.backbone.type=gpt",), "invalid choice: 'gpt' (choose from"),
+        (
+            ("--policy.hidden_dim=64",),
+            "policy.hidden_dim: belongs to the backbone now; give",
+        ),
     ],
 )
 def test_the_command_names_bad_values(lerobot_train_command, small_maze, tmp_path, capfd, flags, message):

@@ -11,7 +11,7 @@ from lerobot_swr.cli.eval_conflicts import refuse_conflicts
 from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import DatasetSource
-from lerobot_swr.styles import check_style_sampling
+from lerobot_swr.styles.drawing import check_style_sampling
 
 
 @dataclass

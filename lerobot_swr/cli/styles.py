@@ -25,11 +25,13 @@ from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.dataset_checks import check_dimensions
 from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.policies.configuration_swr import ZBCConfig
-from lerobot_swr.policies.modeling_swr import ZBCPolicy
-from lerobot_swr.policies.style_extension import add_demonstrations
-from lerobot_swr.style_map import write_style_map
-from lerobot_swr.style_report import format_preview, format_table
-from lerobot_swr.style_table import StyleTable
+from lerobot_swr.policies.style_policy import StylePolicy
+from lerobot_swr.policies.training_data import read_demonstrations
+from lerobot_swr.similarity import similarity_of
+from lerobot_swr.styles.extension import add_demonstrations
+from lerobot_swr.styles.map import write_style_map
+from lerobot_swr.styles.report import format_preview, format_table
+from lerobot_swr.styles.table import StyleTable, make_nearest_table
 from lerobot_swr.trajectories import Trajectories
 
 TEXT_FLAGS = ("filter", "name", "forget", "behavior_rule", "style_metrics")
@@ -104,7 +106,7 @@ def show_styles(cfg: StylesCommand) -> None:
         _make_table_anew(cfg, config)
     checkpoint = load_checkpoint(config)
     policy = checkpoint.policy
-    assert isinstance(policy, ZBCPolicy)
+    assert isinstance(policy, StylePolicy)
     if cfg.add is not None:
         _add(cfg, checkpoint, policy)
         return
@@ -153,7 +155,11 @@ def _make_table_anew(cfg: StylesCommand, config: ZBCConfig) -> None:
     # A policy made for training would take this for its training and describe the dynamics anew.
     policy, meta = checkpoint.policy, cfg.dataset.metadata()
     stored = policy.styles.table
-    table: StyleTable = policy.make_table(policy.read_demonstrations(meta), meta)
+    demonstrations = read_demonstrations(config, meta)
+    similarity = similarity_of(demonstrations, config.compared_keys, Path(meta.root))
+    table = make_nearest_table(
+        demonstrations, similarity, config.behavior_rule, config.style_metrics, meta.robot_type
+    )
     for name, text in ({} if stored is None else stored.filters).items():
         table = table.with_filter(name, text)
     table.save(cfg.checkpoint)
@@ -163,7 +169,11 @@ def _make_table_anew(cfg: StylesCommand, config: ZBCConfig) -> None:
 
 
 def _write_map(
-    cfg: StylesCommand, checkpoint: Checkpoint, policy: ZBCPolicy, table: StyleTable, episodes: Sequence[int]
+    cfg: StylesCommand,
+    checkpoint: Checkpoint,
+    policy: StylePolicy,
+    table: StyleTable,
+    episodes: Sequence[int],
 ) -> None:
     assert cfg.map is not None
     try:
@@ -177,7 +187,7 @@ def _write_map(
     print(f"map written to {cfg.map}")
 
 
-def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: ZBCPolicy) -> None:
+def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: StylePolicy) -> None:
     assert cfg.add is not None
     assert cfg.output_dir is not None
     meta = DatasetSource(root=cfg.add, episodes=cfg.episodes).metadata()
@@ -190,7 +200,7 @@ def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: ZBCPolicy) -> None:
         where, shapes, {key: [d] for key, d in dimensions.items()}, "add demonstrations of the same robot"
     )
     training = _reference(cfg, checkpoint, needs_actions=True)
-    new = policy.read_demonstrations(meta)
+    new = read_demonstrations(policy.config, meta)
     added = add_demonstrations(policy, checkpoint.preprocessor, training, new, cfg.episodes, meta.robot_type)
     _save_new_checkpoint(cfg.checkpoint, policy, cfg.output_dir)
     print("style  nearest demonstration  action error (under the nearest demonstration's style)")
@@ -211,7 +221,7 @@ def _reference(cfg: StylesCommand, checkpoint: Checkpoint, needs_actions: bool =
     return load_reference(cfg.dataset, checkpoint, needs_actions)
 
 
-def _save_new_checkpoint(original: Path, policy: ZBCPolicy, folder: Path) -> None:
+def _save_new_checkpoint(original: Path, policy: StylePolicy, folder: Path) -> None:
     """The original's files (processors, training configuration) with the enlarged policy; all or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = folder.with_name(f".{folder.name}-unfinished")

@@ -1,7 +1,6 @@
 """Behaviour evaluation: compares a policy's rollouts with the demonstrations."""
 
 import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,6 +28,7 @@ from lerobot_swr.evaluation.metrics import (
 )
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.whole_files import write_whole
 
 
 @dataclass(frozen=True)
@@ -244,32 +244,24 @@ def steps_to_end(env_cfg: EnvConfig, trajectories: Trajectories) -> list[int]:
 
 def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:
     """Write a result dataclass and where it comes from, all or nothing."""
-    content = json.dumps({**asdict(result), "provenance": provenance}, indent=2)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(content + "\n")
-    os.replace(temporary, path)
+    write_whole(path, json.dumps({**asdict(result), "provenance": provenance}, indent=2) + "\n")
 
 
 def format_result(result: BehaviorResult) -> str:
     """A table for the terminal."""
-
-    def interval(value: Interval) -> str:
-        return f"[{value.low:.3f}, {value.high:.3f}]"
-
     fidelity = "-" if result.style_fidelity is None else f"{result.style_fidelity:.3f}"
     rows = [
         ("rollouts", f"{result.n_episodes}", f"styles drawn: {result.style_sampling or 'none'}"),
-        ("success", f"{result.success_rate:.3f}", f"{interval(result.success_interval)} Wilson 95 %"),
-        ("max reward", f"{result.max_reward:.3f}", f"{interval(result.max_reward_interval)} bootstrap 95 %"),
-        ("L1", f"{result.l1:.3f}", f"{interval(result.l1_interval)} bootstrap 95 %"),
-        ("L1 floor", f"{result.l1_floor:.3f}", f"{interval(result.l1_floor_band)} perfect reproducer, 95 %"),
+        ("success", f"{result.success_rate:.3f}", f"{result.success_interval:.3f} Wilson 95 %"),
+        ("max reward", f"{result.max_reward:.3f}", f"{result.max_reward_interval:.3f} bootstrap 95 %"),
+        ("L1", f"{result.l1:.3f}", f"{result.l1_interval:.3f} bootstrap 95 %"),
+        ("L1 floor", f"{result.l1_floor:.3f}", f"{result.l1_floor_band:.3f} perfect reproducer, 95 %"),
         ("coverage", f"{result.coverage:.3f}", "share of demonstrated behaviours shown"),
         ("entropy", f"{result.entropy:.3f}", "of successes, in log(number of demonstrated behaviours)"),
         ("style fidelity", fidelity, "rollouts that show their style's demonstration's behaviour"),
     ]
     if result.length_error is not None and result.length_error_interval is not None:
-        bounds = interval(result.length_error_interval)
+        bounds = f"{result.length_error_interval:.3f}"
         rows.append(("length error", f"{result.length_error:.1f}", f"{bounds} bootstrap 95 %, median, steps"))
     lines = [f"{name:<15} {value:>7}  {note}" for name, value, note in rows]
     lines.append(f"{'behaviour':<24} {'demos':>6} {'rollouts':>8}")

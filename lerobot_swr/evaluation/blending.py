@@ -11,7 +11,7 @@ from lerobot.envs import EnvConfig
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
-from lerobot_swr.styles import StyleCookbook
+from lerobot_swr.styles.request import StyleRequest
 
 SHARES = tuple(np.linspace(0, 1, 9).tolist())
 SAME, DIFFERENT = "same behaviour", "different behaviours"
@@ -88,17 +88,10 @@ def run_blends(
         raise ValueError("blend: a policy with at least 2 styles to draw is needed")
     pairs = draw_pairs(allowed, demonstrated, n_pairs, seed)
     plan = [(kind, i, j, share) for kind, some in pairs.items() for i, j in some for share in SHARES]
-    original = policy.styles
-    weight = original.embedding.weight.detach()
+    weight = policy.styles.embedding.weight.detach()
     blends = torch.stack([torch.lerp(weight[i], weight[j], share) for _, i, j, share in plan])
-    blended = StyleCookbook(len(plan), blends.shape[1], 0.0, "fixed").to(weight.device)
-    blended.embedding.weight.data = blends
-    blended.trained.fill_(1)
-    policy.styles = blended
-    try:
+    with policy.styles.requested(StyleRequest(vectors=blends)):
         rollouts = run_rollouts(checkpoint, env_cfg, rule, len(plan), batch_size, seed, [seed] * len(plan))
-    finally:
-        policy.styles = original
     records = [
         {
             "pair": kind,

@@ -12,6 +12,7 @@ from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import Interval, histogram, style_fidelity, success_interval
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.styles.request import StyleRequest
 from lerobot_swr.trajectories import Trajectories
 
 
@@ -110,16 +111,10 @@ def run_counterfactual(
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     allowed = [i for i in styles.allowed().tolist() if i < len(demonstrated)]
     plan = plan_requests(allowed, demonstrated, per_behavior, seed)
-    previous = styles.selection, styles.sampling
-    styles.sampling = "fixed"
-    styles.select([episode for _, episode in plan])
-    try:
+    with styles.requested(StyleRequest([episode for _, episode in plan])):
         rollouts = run_rollouts(
             checkpoint, env_cfg, rule, len(plan), batch_size, seed, [seed + start for start, _ in plan]
         )
-    finally:
-        styles.sampling = previous[1]
-        styles.restrict(previous[0])
     demonstrations = trajectories.states([OBS_STATE])
     return evaluate_counterfactual(
         rollouts, [start for start, _ in plan], demonstrated, demonstrations
@@ -190,7 +185,7 @@ def format_counterfactual(result: CounterfactualResult) -> str:
         lines.append("  ".join([f"{label:<17}", *counts, f"{result.accuracy_by_behavior[label]:8.3f}"]))
     interval, lowest = result.control_interval, min(result.accuracy_by_behavior.values())
     lines += [
-        f"control accuracy {result.control_accuracy:.3f}  [{interval.low:.3f}, {interval.high:.3f}] "
+        f"control accuracy {result.control_accuracy:.3f}  {interval:.3f} "
         f"Wilson 95 %, {result.n_episodes} rollouts; lowest of a behaviour {lowest:.3f}",
         f"distance to the requested demonstration {result.distance:.4f}, to the others "
         f"{result.distance_to_others:.4f} (RMS over time, units of the state)",

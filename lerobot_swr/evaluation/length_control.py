@@ -104,7 +104,7 @@ def format_length_control(result: LengthControlResult) -> str:
     return (
         f"lengths         L1 {result.l1:.3f} to the {result.n_demonstrations} demonstrations of "
         f"{result.band[0]} to {result.band[1]} frames (bins of {BIN_WIDTH}; perfect reproducer "
-        f"{result.l1_floor:.3f} [{floor.low:.3f}, {floor.high:.3f}])\n"
+        f"{result.l1_floor:.3f} {floor:.3f})\n"
         f"                {result.in_band:.3f} of {result.n_episodes} rollouts in that band ± {TOLERANCE} "
         f"steps (counting {result.frames_after_end} frames that demonstrations record after the end)"
     )

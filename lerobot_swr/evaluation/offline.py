@@ -1,6 +1,7 @@
 """Offline evaluation: action errors on a dataset's frames, where there is no simulator."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -9,8 +10,8 @@ from torch import Tensor
 
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
-from lerobot_swr.policies.modeling_swr import BCPolicy, ZBCPolicy
-from lerobot_swr.similarity import pairwise_distances
+from lerobot_swr.policies.style_policy import StylePolicy
+from lerobot_swr.similarity import similarity_of
 from lerobot_swr.trajectories import Trajectories
 
 BATCH = 4096
@@ -73,14 +74,14 @@ def frame_errors(
         ValueError: For another type of policy, or when fewer than 2 episodes have a style.
     """
     policy = checkpoint.policy
-    if not isinstance(policy, BCPolicy):
+    if not isinstance(policy, StylePolicy):
         raise ValueError(
             f"policy.type={policy.config.type!r}: offline evaluation knows bc, zbc and wzbc; "
             "evaluate this policy in an environment (--env.type=...)"
         )
     chosen = np.arange(len(trajectories)) if episodes is None else np.array(episodes)
     styles: dict[str, np.ndarray | None] = {"none": None}
-    if isinstance(policy, ZBCPolicy):
+    if policy.has_styles:
         # Styles added for episodes of other datasets follow those of the training dataset.
         allowed = policy.styles.allowed().cpu().numpy()
         drawable = np.sort(allowed[allowed < len(trajectories)])
@@ -99,7 +100,7 @@ def frame_errors(
         [trajectories.starts[i] + np.arange(trajectories.lengths[i]) for i in chosen]
     )  # (F,) rows
     episode_of_frame = np.repeat(chosen, trajectories.lengths[chosen])
-    if isinstance(policy, ZBCPolicy):
+    if policy.has_styles:
         styles = _styles_of_frames(policy, trajectories, drawable, episode_of_frame, seed)
     squared = {kind: _squared_errors(checkpoint, trajectories, frames, used) for kind, used in styles.items()}
     place = frames - trajectories.starts[episode_of_frame]
@@ -108,15 +109,14 @@ def frame_errors(
 
 
 def _styles_of_frames(
-    policy: ZBCPolicy, trajectories: Trajectories, drawable: np.ndarray, own: np.ndarray, seed: int
+    policy: StylePolicy, trajectories: Trajectories, drawable: np.ndarray, own: np.ndarray, seed: int
 ) -> dict[str, np.ndarray | None]:
     """Kind of style to the (F,) episodes whose styles the frames use."""
-    distances = pairwise_distances(trajectories.states(policy.compared_keys()))
-    np.fill_diagonal(distances, np.inf)
-    nearest = drawable[distances[:, drawable].argmin(axis=1)]  # (N,)
+    similarity = similarity_of(trajectories, policy.config.compared_keys, Path(trajectories.name))
+    nearest = similarity.nearest(drawable, 1, drawable)[0][:, 0].astype(np.int64)
     place = np.searchsorted(drawable, own)
     shift = np.random.default_rng(seed).integers(1, len(drawable), size=len(own))
-    return {"own": own, "nearest": nearest[own], "random": drawable[(place + shift) % len(drawable)]}
+    return {"own": own, "nearest": nearest[place], "random": drawable[(place + shift) % len(drawable)]}
 
 
 @torch.no_grad()
@@ -124,7 +124,7 @@ def _squared_errors(
     checkpoint: Checkpoint, trajectories: Trajectories, frames: np.ndarray, styles: np.ndarray | None
 ) -> np.ndarray:
     policy = checkpoint.policy
-    assert isinstance(policy, BCPolicy)
+    assert isinstance(policy, StylePolicy)
     parts = []
     for start in range(0, len(frames), BATCH):
         rows = frames[start : start + BATCH]
@@ -135,7 +135,6 @@ def _squared_errors(
         batch = checkpoint.preprocessor(raw)
         style = None
         if styles is not None:
-            assert isinstance(policy, ZBCPolicy)
             used = torch.from_numpy(styles[start : start + BATCH]).to(batch[OBS_STATE].device)
             style = policy.styles.embedding(used)
         parts.append((policy.predict(batch, style) - batch[ACTION]).square().cpu().numpy())
@@ -170,5 +169,5 @@ def format_offline(result: OfflineResult) -> str:
     ]
     for kind, error in result.action_error.items():
         interval = result.action_error_interval[kind]
-        lines.append(f"  {KINDS[kind]:<42} {error:.5f}  [{interval.low:.5f}, {interval.high:.5f}]")
+        lines.append(f"  {KINDS[kind]:<42} {error:.5f}  {interval:.5f}")
     return "\n".join(lines)

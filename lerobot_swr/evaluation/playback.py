@@ -17,7 +17,8 @@ from torch import Tensor, nn
 from lerobot_swr.corrective.feedback import Feedback
 from lerobot_swr.corrective.inverse_model import fit_inverse_model
 from lerobot_swr.evaluation.checkpoint import Checkpoint
-from lerobot_swr.styles import StyleCookbook, StyleSampling
+from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.drawing import StyleSampling
 from lerobot_swr.trajectories import Trajectories
 
 

@@ -50,7 +50,7 @@ def plot_behaviors(
     """
     figure = Figure(figsize=(13, 4.4), layout="constrained")
     # Apart, so that long labels under the histograms do not squeeze the paths.
-    scenes, bars = np.ravel(figure.subfigures(1, 2, width_ratios=(2, 1.35)))
+    scenes, bars = figure.subfigures(1, 2, squeeze=False, width_ratios=(2, 1.35))[0]
     left, middle = scenes.subplots(1, 2)
     colors = behavior_colors([*reference, *shown])
     for axes, paths, name in ((left, demonstrations, "demonstrations"), (middle, rollouts, "rollouts")):

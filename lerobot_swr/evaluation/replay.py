@@ -176,7 +176,7 @@ def format_replay(result: ReplayResult) -> str:
     shown = "-" if match is None else f"{match:.3f}"
     lines = [
         f"{'replays':<11} {result.n_episodes:>7}",
-        f"{'success':<11} {result.success_rate:7.3f}  [{bounds.low:.3f}, {bounds.high:.3f}] Wilson 95 %",
+        f"{'success':<11} {result.success_rate:7.3f}  {bounds:.3f} Wilson 95 %",
         f"{'behaviour':<11} {shown:>7}  of the replays show that of their recording",
     ]
     if result.clipped_actions:

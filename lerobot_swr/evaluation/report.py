@@ -8,6 +8,8 @@ from pathlib import Path
 
 from jinja2 import Environment
 
+from lerobot_swr.whole_files import write_whole
+
 TEMPLATE = """<!doctype html>
 <html lang="en">
 <head>
@@ -150,7 +152,7 @@ def write_report(
         title=title, introduction=introduction, sections=sections, commands=commands, versions=versions
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)
 
 
 def write_markdown(
@@ -180,4 +182,4 @@ def write_markdown(
         title=title, introduction=introduction, sections=sections, commands=commands, versions=versions
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page.rstrip() + "\n", encoding="utf-8")
+    write_whole(path, page.rstrip() + "\n")

@@ -158,4 +158,4 @@ def format_robustness(result: RobustnessResult) -> str:
 def _with_interval(value: float | None, interval: Interval | None, digits: int) -> str:
     if value is None or interval is None:
         return "-"
-    return f"{value:.{digits}f} [{interval.low:.{digits}f}, {interval.high:.{digits}f}]"
+    return f"{value:.{digits}f} {interval:.{digits}f}"

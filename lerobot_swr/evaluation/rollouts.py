@@ -13,7 +13,7 @@ from lerobot.utils.random_utils import set_seed
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
-from lerobot_swr.styles import BLENDED
+from lerobot_swr.styles.cookbook import BLENDED
 
 
 @dataclass(frozen=True)

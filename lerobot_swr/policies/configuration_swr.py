@@ -5,16 +5,19 @@ Denoyer; arXiv 2504.18160), "the paper". Defaults are the paper's values, except
 otherwise; `docs/method.md` gives the reasons and the flags of the paper's literal network.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.utils.constants import ACTION
 
 from lerobot_swr.configuration import tells_bad_values
+from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
+from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import check_beta, check_normalization
-from lerobot_swr.style_selection import StyleSelection
-from lerobot_swr.styles import check_style_sampling
+from lerobot_swr.styles.drawing import check_style_sampling
+from lerobot_swr.styles.selection import StyleSelection
 
 
 @PreTrainedConfig.register_subclass("bc")
@@ -26,14 +29,9 @@ class BCConfig(StateConfig):
     it is defined.
     """
 
-    # --- Network ---
-    # Width of the hidden layers.
-    hidden_dim: int = 128
-    # Number of hidden layers.
-    num_hidden: int = 10
-    # Add each hidden layer's input to its output. Deviates from the paper's plain network, which trains
-    # unreliably at this depth.
-    residual: bool = True
+    # --- Backbone: what learns the actions ---
+    # Its type and, beside it, the options of that type, e.g. --policy.backbone.hidden_dim=64.
+    backbone: BackboneConfig = field(default_factory=MLPConfig)
 
     # --- Training ---
     # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
@@ -49,6 +47,11 @@ class BCConfig(StateConfig):
     # Hash of the training dataset's states; tells resuming from fine-tuning on other data.
     dataset_fingerprint: str | None = None
 
+    # --- Options of version 0.1, refused: they are the backbone's now ---
+    hidden_dim: int | None = None
+    num_hidden: int | None = None
+    residual: bool | None = None
+
     @tells_bad_values
     def __post_init__(self) -> None:
         """Check the values.
@@ -56,8 +59,25 @@ class BCConfig(StateConfig):
         Raises:
             ValueError: Naming the offending key and value.
         """
+        self._refuse_moved_options()
         super().__post_init__()
-        self.check_at_least_one("hidden_dim", "num_hidden")
+
+    def _refuse_moved_options(self) -> None:
+        moved = {key: getattr(self, key) for key in ("hidden_dim", "num_hidden", "residual")}
+        given = {key: value for key, value in moved.items() if value is not None}
+        if self.num_episodes is not None and len(given) == len(moved):
+            raise ValueError(
+                f"this {self.type} checkpoint was made by version 0.1, which this version does not read: "
+                "train the policy anew, or use it with lerobot_policy_swr 0.1"
+            )
+        if given:
+            now = " ".join(f"--policy.backbone.{key}={str(value).lower()}" for key, value in given.items())
+            raise ValueError(f"policy.{', policy.'.join(given)}: belongs to the backbone now; give {now}")
+
+    @property
+    def compared_keys(self) -> list[str]:
+        """The features over which ν compares demonstrations."""
+        return self.observation_keys
 
 
 @PreTrainedConfig.register_subclass("zbc")
@@ -198,3 +218,17 @@ class WZBCConfig(ZBCConfig):
         check_probability(self.p)
         check_partner_sampling(self.partner_sampling)
         check_normalization(self.similarity_normalization)
+
+    @property
+    def compared_keys(self) -> list[str]:
+        """The features over which ν compares demonstrations.
+
+        Raises:
+            ValueError: If a configured feature is unknown.
+        """
+        keys = self.similarity_keys or self.observation_keys
+        known = [*self.observation_keys, ACTION]
+        unknown = [key for key in keys if key not in known]
+        if unknown:
+            raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
+        return keys

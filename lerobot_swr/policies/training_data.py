@@ -2,16 +2,29 @@
 
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Self
 
+import numpy as np
+import torch
 from lerobot.configs import FeatureType, NormalizationMode, PolicyFeature
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.constants import ACTION, OBS_PREFIX, OBS_STATE
 
-from lerobot_swr.configuration import training_episodes
 from lerobot_swr.dataset_checks import check_dimensions, check_frame_numbers, missing_feature
 from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.dataset_statistics import usable_statistics
+from lerobot_swr.pauses import pause_frames
+from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.policies.state_config import StateConfig
+from lerobot_swr.run_context import RunContext
+from lerobot_swr.sampling import PartnerSampler
+from lerobot_swr.similarity import Similarity, similarity_of
+from lerobot_swr.styles.encoding import Frames
+from lerobot_swr.styles.table import OUTCOMES, StyleTable, make_nearest_table
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 logger = logging.getLogger(__name__)
@@ -72,7 +85,7 @@ def _usable(key: str, meta: LeRobotDatasetMetadata) -> bool:
 
 
 def read_training_data(
-    config: StateConfig, meta: LeRobotDatasetMetadata, optional: Sequence[str] = ()
+    config: StateConfig, meta: LeRobotDatasetMetadata, run: RunContext, optional: Sequence[str] = ()
 ) -> Trajectories:
     """The data that LeRobot's training will show, after comparing the dataset's statistics with them.
 
@@ -81,6 +94,7 @@ def read_training_data(
     Args:
         config: The policy's configuration, with the features of `adopt_features`.
         meta: Metadata of the training dataset.
+        run: The training run.
         optional: Further features to read, left out where they are not usable.
 
     Raises:
@@ -89,10 +103,128 @@ def read_training_data(
     """
     keys = list(config.dimensions)
     trajectories = load_trajectories(meta, keys, optional)
-    check_frame_numbers(meta, keys, training_episodes(meta))
+    check_frame_numbers(meta, keys, None if len(run.episodes) == meta.total_episodes else run.episodes)
     features = {**(config.input_features or {}), **(config.output_features or {})}
     identity = NormalizationMode.IDENTITY
-    modes = {key: config.normalization_mapping.get(features[key].type.value, identity) for key in keys}
+    mapping = config.normalization_mapping
+    modes = {key: NormalizationMode(mapping.get(features[key].type.value, identity)) for key in keys}
     columns = {key: trajectories.columns[key] for key in keys}
     meta.stats = usable_statistics(meta, columns, modes, int(trajectories.lengths.max()))
     return trajectories
+
+
+def read_demonstrations(config: StateConfig, meta: LeRobotDatasetMetadata) -> Trajectories:
+    """What a policy takes from a dataset that it need not train on: observations, actions, outcomes."""
+    return load_trajectories(meta, [*config.observation_keys, ACTION], OUTCOMES)
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """The dataset that a policy is created to be trained on.
+
+    Attributes:
+        config: The policy's configuration.
+        meta: Metadata of the dataset.
+        run: The training run.
+        trajectories: All of the dataset's episodes.
+        fingerprint: Hash of their states.
+        from_checkpoint: Whether the network comes from a checkpoint.
+        is_new: Whether it comes from one that was trained on another dataset.
+        pauses: (F,) bool, which frames are left out; None for none.
+    """
+
+    config: BCConfig
+    meta: LeRobotDatasetMetadata
+    run: RunContext
+    trajectories: Trajectories
+    fingerprint: str
+    from_checkpoint: bool
+    is_new: bool
+    pauses: np.ndarray | None
+
+    @classmethod
+    def read(cls, config: BCConfig, meta: LeRobotDatasetMetadata) -> Self:
+        """Read the dataset; tell whether the checkpoint, if any, was trained on it.
+
+        Args:
+            config: The policy's configuration, with the features of `adopt_features`.
+            meta: Metadata of the training dataset.
+
+        Raises:
+            ValueError: If the data or statistics are not usable, or a resumed run's dataset is not the
+                checkpoint's.
+        """
+        run = RunContext.current(meta)
+        trajectories = read_training_data(config, meta, run, OUTCOMES)
+        fingerprint, known = trajectories.fingerprint([OBS_STATE]), config.dataset_fingerprint
+        is_new = known is not None and known != fingerprint
+        if is_new and run.resuming:
+            raise ValueError(
+                f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
+                f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
+                "original dataset, or fine-tune on this one with --policy.path instead of --resume"
+            )
+        pauses = _find_pauses(trajectories, config) if config.skip_pauses else None
+        return cls(config, meta, run, trajectories, fingerprint, known is not None, is_new, pauses)
+
+    @property
+    def root(self) -> Path:
+        """Folder of the dataset."""
+        return Path(self.meta.root)
+
+    @cached_property
+    def moving(self) -> Trajectories:
+        """The episodes without the frames that are left out."""
+        return self.trajectories if self.pauses is None else self.trajectories.without(self.pauses)
+
+    @cached_property
+    def similarity(self) -> Similarity:
+        """Distances of the episodes over the features that ν compares."""
+        return similarity_of(self.trajectories, self.config.compared_keys, self.root)
+
+    def frames(self, episode: int, rows: np.ndarray) -> Frames:
+        """Some frames of an episode, as batches bring them."""
+        preprocessor, _ = make_bc_pre_post_processors(self.config, self.meta.stats)
+        columns = self.trajectories.episode(episode)
+        keys = [*self.config.observation_keys, ACTION]
+        batch = preprocessor({key: torch.from_numpy(columns[key][rows]) for key in keys})
+        return {key: batch[key] for key in keys}
+
+
+def make_sampler(config: WZBCConfig, data: TrainingData) -> PartnerSampler:
+    """Draws partners among the episodes that are trained on.
+
+    Raises:
+        ValueError: If there is a single one.
+    """
+    if len(data.run.episodes) < 2:
+        raise ValueError(
+            f"dataset.root={str(data.root)!r}: a single episode to train on; wzbc compares "
+            "episodes and needs at least 2: record more, leave more in, or use --policy.type=zbc"
+        )
+    return PartnerSampler(
+        data.similarity,
+        np.array(data.run.episodes),
+        config.beta,
+        config.p,
+        config.similarity_normalization,  # type: ignore[arg-type]
+        config.partner_sampling,  # type: ignore[arg-type]
+    )
+
+
+def make_table(config: ZBCConfig, data: TrainingData) -> StyleTable:
+    """The table of the demonstrations, with the columns that the configuration asks for."""
+    rule, metrics, robot = config.behavior_rule, config.style_metrics, data.meta.robot_type
+    return make_nearest_table(data.trajectories, data.similarity, rule, metrics, robot)
+
+
+def _find_pauses(trajectories: Trajectories, config: BCConfig) -> np.ndarray | None:
+    pauses = pause_frames(trajectories, config.observation_keys, ACTION)
+    if not pauses.any():
+        return None
+    logger.info(
+        "%.1f %% of the frames are pauses before a movement, which a policy without memory cannot "
+        "learn: left out (policy.skip_pauses=false keeps them)",
+        100 * pauses.mean(),
+    )
+    return pauses

@@ -19,6 +19,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from lerobot_swr.whole_files import write_whole
+
 FORMAT = 2  # of results; another one makes every cell a new one
 PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy", "mujoco", "diffusers")  # noted where installed
 
@@ -127,7 +129,7 @@ class Store:
 
     def begin(self, cell: Cell, command: str) -> None:
         """Note that a command computes the cell; see `this_command`."""
-        write_text(self.running_path(cell), command)
+        write_whole(self.running_path(cell), command)
 
     def is_running(self, cell: Cell, command: str) -> bool:
         """Whether an attempt of this command, and not of another one on the same store, has not ended."""
@@ -159,7 +161,7 @@ class Store:
                 "versions": installed_versions(),
             },
         }
-        write_text(self.result_path(cell), json.dumps(content, separators=(",", ":")) + "\n")
+        write_whole(self.result_path(cell), json.dumps(content, separators=(",", ":")) + "\n")
 
     @contextmanager
     def lock(self, cell: Cell) -> Iterator[int]:
@@ -191,14 +193,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, all or nothing."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def installed_versions() -> dict[str, str]:

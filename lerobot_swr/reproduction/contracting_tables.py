@@ -23,8 +23,7 @@ def length_error(summary: Summary) -> str:
     """The median length error with its interval."""
     if summary.length_error is None or summary.length_error_interval is None:
         return NOTHING
-    low, high = summary.length_error_interval.low, summary.length_error_interval.high
-    return f"{summary.length_error:.1f}\n[{low:.1f}, {high:.1f}]"
+    return f"{summary.length_error:.1f}\n{summary.length_error_interval:.1f}"
 
 
 def unperturbed(suite: SuiteResults, dataset: str) -> Table:

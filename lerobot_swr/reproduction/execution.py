@@ -14,7 +14,7 @@ import torch
 from joblib import Parallel, delayed
 
 from lerobot_swr.reproduction.baselines import known_policies, missing_extras
-from lerobot_swr.reproduction.cells import Cell, Store, this_command, write_text
+from lerobot_swr.reproduction.cells import Cell, Store, this_command
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
 from lerobot_swr.reproduction.measurement import measure
 from lerobot_swr.reproduction.planning import (
@@ -28,6 +28,7 @@ from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.style_geometry import compute_similarity, compute_style_map
 from lerobot_swr.reproduction.suites import suite_cells, suite_datasets
 from lerobot_swr.reproduction.training import train
+from lerobot_swr.whole_files import write_whole
 
 
 @dataclass(frozen=True)
@@ -198,7 +199,7 @@ def _failed(cell: Cell, store: Store, command: str, message: str, details: str =
     """Note a failure; where even that cannot be written (disk full), the command still names it."""
     with contextlib.suppress(OSError):
         store.end(cell, command)
-        write_text(store.failure_path(cell), message + "\n")
+        write_whole(store.failure_path(cell), message + "\n")
         with store.log_path(cell).open("a") as log:
             log.write(details or message + "\n")
     return Failure(cell, message, store.log_path(cell))
@@ -242,4 +243,4 @@ def _write_manifest(
         "datasets": {demos.name: store.result_path(demos.cell).name for demos in datasets},
         "cells": [store.result_path(cell).name for cell in cells],
     }
-    write_text(store.root / "suites" / f"{suite}.json", json.dumps(content, indent=1) + "\n")
+    write_whole(store.root / "suites" / f"{suite}.json", json.dumps(content, indent=1) + "\n")

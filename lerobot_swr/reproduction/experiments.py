@@ -11,6 +11,7 @@ from typing import Any
 import draccus
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Labels
 from lerobot_swr.reproduction.demonstrations import Demonstrations, whole_environment
@@ -18,6 +19,7 @@ from lerobot_swr.reproduction.settings import ReproductionSettings
 from lerobot_swr.reproduction.training import STACKED
 
 EVALUATION_SEED = 1000
+BACKBONE = "backbone."  # before the names of a backbone's options
 PLAYBACK = "playback"  # with feedback: the baseline without a policy
 
 
@@ -48,17 +50,14 @@ def training(
         recipe, batch_size, given = baseline.options, baseline.batch_size, {}
         default_steps, default_seeds = getattr(settings, baseline.steps), settings.baseline_seeds
     make = PreTrainedConfig.get_choice_class(policy)
-    unknown = sorted(given.keys() - {option.name for option in fields(make)})
+    unknown = sorted({key.split(".")[0] for key in given} - {option.name for option in fields(make)})
     if unknown:
         raise ValueError(
             f"policy_options={dict(settings.policy_options)}: {policy!r} has no option {unknown[0]!r}; "
             "choose the policies that have it with --policies=[...]"
         )
 
-    def encode(chosen: Mapping[str, Any]) -> dict[str, Any]:
-        return draccus.encode(make(device="cpu", push_to_hub=False, **chosen), PreTrainedConfig)
-
-    config, usual = encode({**recipe, **given}), encode(recipe)
+    config, usual = _all_options(make, {**recipe, **given}), _all_options(make, recipe)
     differing = {key: config[key] for key in config if key in given and config[key] != usual[key]}
     definition = {
         "fingerprint": demos.fingerprint,
@@ -73,10 +72,21 @@ def training(
     return Cell("train", Labels(demos.name, variant_name(policy, differing), "training"), definition)
 
 
+def _all_options(make: type[PreTrainedConfig], given: Mapping[str, Any]) -> dict[str, Any]:
+    """All options of a policy, encoded; those of its backbone are called ``backbone.<option>``."""
+    plain = {key: value for key, value in given.items() if not key.startswith(BACKBONE)}
+    inner = {key.removeprefix(BACKBONE): value for key, value in given.items() if key.startswith(BACKBONE)}
+    if inner:
+        plain["backbone"] = draccus.decode(BackboneConfig, inner)
+    options = draccus.encode(make(device="cpu", push_to_hub=False, **plain), PreTrainedConfig)
+    backbone = options.pop("backbone", {})
+    return {**{BACKBONE + key: value for key, value in backbone.items()}, **options}
+
+
 def variant_name(policy: str, differing: Mapping[str, Any]) -> str:
     """A policy's name with the options that differ from its usual ones."""
     values = {key: f"{v:g}" if isinstance(v, float) else str(v) for key, v in differing.items()}
-    return " ".join([policy, *(f"{key}={value}" for key, value in values.items())])
+    return " ".join([policy, *(f"{key.removeprefix(BACKBONE)}={value}" for key, value in values.items())])
 
 
 def evaluation(

@@ -16,10 +16,11 @@ from lerobot_swr.evaluation.checkpoint import (
 )
 from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
-from lerobot_swr.reproduction.cells import Cell, Store, write_text
+from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import environment, short_path
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS
 from lerobot_swr.reproduction.training import checkpoint_folder
+from lerobot_swr.whole_files import write_whole
 
 BATCH_SIZE = 100  # environments that run at once
 
@@ -46,7 +47,7 @@ def measure(cell: Cell, store: Store, dataset: Path) -> dict[str, Any]:
         for protocol in cell.definition["protocols"]:
             path = store.work_folder(cell) / "parts" / f"seed_{seed}-{protocol}.json"
             if not path.is_file():
-                write_text(path, json.dumps(_part(cell, store, dataset, seed, protocol)))
+                write_whole(path, json.dumps(_part(cell, store, dataset, seed, protocol)))
             part = json.loads(path.read_text())
             result["rollouts"][str(seed)][protocol] = part["rollouts"]
             result["allowed"] = part["allowed"]

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_swr.reproduction import figures, paper, tables
-from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.stored_results import StoredCell, load_suites
 from lerobot_swr.reproduction.suites import UNPERTURBED
+from lerobot_swr.whole_files import write_whole
 
 START, END = "<!-- results: written by lerobot-swr-report -->", "<!-- end of results -->"
 PICTURE = "result.png"
@@ -50,7 +50,7 @@ def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = 
         shutil.rmtree(target / folder, ignore_errors=True)
         (target / folder).mkdir(parents=True)
     for name, manifest in manifests.items():
-        write_text(target / "suites" / f"{name}.json", json.dumps(manifest, indent=1) + "\n")
+        write_whole(target / "suites" / f"{name}.json", json.dumps(manifest, indent=1) + "\n")
         for file in (*manifest["datasets"].values(), *manifest["cells"]):
             if file in origin:  # others are not finished
                 shutil.copy(origin[file], target / "results")
@@ -132,7 +132,7 @@ def update_readme(readme: Path, root: Path) -> None:
     Raises:
         ValueError: If the file has no markers.
     """
-    write_text(readme, with_block(readme.read_text(encoding="utf-8"), readme_block(root), readme))
+    write_whole(readme, with_block(readme.read_text(encoding="utf-8"), readme_block(root), readme))
     suite = load_suites(root)["table1"]
     for dataset, policy in PICTURED:
         pictured = [cell for cell in suite.evaluations(dataset) if cell.policy == policy]
@@ -161,7 +161,7 @@ def _readme_row(cell: StoredCell) -> tuple[str, ...]:
         tables.rollouts(uniform),
         tables.NOTHING if stratified is None else tables.l1(stratified).replace("\n", " "),
         f"{uniform.l1:.3f} ({tables.floor(uniform)})".replace("\n", " "),
-        f"{success.mean:.3f} {tables.bracket(success.interval)}",
+        f"{success.mean:.3f} {success.interval:.3f}",
         tables.NOTHING if fidelity is None else f"{fidelity.mean:.3f}",
         tables.quoted(paper.table1(cell.labels.dataset, cell.policy)).replace("\n", " "),
     )

@@ -8,7 +8,6 @@ from typing import Any
 
 from lerobot_swr.evaluation.report import Picture, Section, write_markdown, write_report
 from lerobot_swr.reproduction import contracting_tables, figures, tables
-from lerobot_swr.reproduction.cells import write_text
 from lerobot_swr.reproduction.paper import SOURCE
 from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
 from lerobot_swr.reproduction.stored_results import (
@@ -18,6 +17,7 @@ from lerobot_swr.reproduction.stored_results import (
     load_suites,
 )
 from lerobot_swr.reproduction.suites import UNPERTURBED
+from lerobot_swr.whole_files import write_whole
 
 INTRODUCTION = (
     f"Experiments of {SOURCE}, repeated with the policies and environments of lerobot_swr. The mazes, the "
@@ -57,7 +57,7 @@ def write_results_report(root: Path) -> Path:
         if name in suites
         for section in (*make(suites[name], pictures), *_missing(suites[name]))
     ]
-    write_text(root / "summaries.json", json.dumps(_summaries(suites), indent=1) + "\n")
+    write_whole(root / "summaries.json", json.dumps(_summaries(suites), indent=1) + "\n")
     report = root / "report.html"
     commands = [suite.command for suite in suites.values() if suite.command]
     content = (

@@ -39,7 +39,7 @@ class ReproductionSettings:
     from_d3il: Path | None = None
     # Only these policies.
     policies: list[str] | None = None
-    # Options of bc, zbc and wzbc that differ from their defaults, e.g. {hidden_dim: 64}.
+    # Options of bc, zbc and wzbc that differ from their defaults, e.g. {backbone.hidden_dim: 64}.
     policy_options: dict[str, Any] = field(default_factory=dict)
     # Where everything is written.
     output_dir: Path = Path("outputs/reproduction")

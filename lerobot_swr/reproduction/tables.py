@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lerobot_swr.evaluation.length_control import BIN_WIDTH, TOLERANCE
-from lerobot_swr.evaluation.metrics import Interval
 from lerobot_swr.evaluation.report import Table
 from lerobot_swr.reproduction import paper
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
@@ -56,17 +55,12 @@ def deviating(figure: paper.Deviating) -> str:
     return f"{figure[0]:.3f} ± {figure[1]:.3f}"
 
 
-def bracket(interval: Interval) -> str:
-    """An interval."""
-    return f"[{interval.low:.3f}, {interval.high:.3f}]"
-
-
 def share(rate: Rate | None) -> str:
     """A share with its interval and the range over seeds."""
     if rate is None:
         return NOTHING
     seeds = f"({min(rate.by_seed):.2f} to {max(rate.by_seed):.2f})"
-    return f"{rate.mean:.3f}\n{bracket(rate.interval)}\n{seeds}"
+    return f"{rate.mean:.3f}\n{rate.interval:.3f}\n{seeds}"
 
 
 def l1(summary: Summary | None) -> str:
@@ -75,12 +69,12 @@ def l1(summary: Summary | None) -> str:
         return NOTHING
     inside = summary.floor.band.low <= summary.l1 <= summary.floor.band.high
     star = "" if inside or summary.protocol != "uniform" else " *"
-    return f"{summary.l1:.3f}{star}\n{bracket(summary.l1_interval)}"
+    return f"{summary.l1:.3f}{star}\n{summary.l1_interval:.3f}"
 
 
 def floor(summary: Summary | None) -> str:
     """The floor with its band."""
-    return NOTHING if summary is None else f"{summary.floor.mean:.3f}\n{bracket(summary.floor.band)}"
+    return NOTHING if summary is None else f"{summary.floor.mean:.3f}\n{summary.floor.band:.3f}"
 
 
 def steps(cell: StoredCell) -> str:
@@ -259,7 +253,7 @@ def _difference(cell: StoredCell | None, reference: StoredCell, column: int) -> 
     mean, interval = difference_interval(first, second)
     clear = interval.low > 0 or interval.high < 0
     mean = round(mean, 3) + 0.0  # no -0.000
-    return f"{mean:+.3f}{' *' if clear else '  '}\n{bracket(interval)}"
+    return f"{mean:+.3f}{' *' if clear else '  '}\n{interval:.3f}"
 
 
 def teaching(cell: StoredCell) -> Table:
@@ -295,9 +289,9 @@ def control(suite: SuiteResults, dataset: str) -> Table:
                 cell.labels.policy,
                 "controlled" if cell.labels.condition == "controlled" else "free",
                 rollouts(summary),
-                f"{found.l1:.3f}\n{bracket(found.l1_interval)}\n"
+                f"{found.l1:.3f}\n{found.l1_interval:.3f}\n"
                 f"({min(found.l1_by_seed):.3f} to {max(found.l1_by_seed):.3f})",
-                f"{found.floor.mean:.3f}\n{bracket(found.floor.band)}",
+                f"{found.floor.mean:.3f}\n{found.floor.band:.3f}",
                 share(found.in_band),
                 share(summary.success),
             )

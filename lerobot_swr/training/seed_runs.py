@@ -26,10 +26,11 @@ from lerobot.utils.constants import (
 )
 from lerobot.utils.random_utils import set_seed
 
-from lerobot_swr.configuration import resuming, training_on
-from lerobot_swr.policies.modeling_swr import BCPolicy
+from lerobot_swr.policies.style_policy import StylePolicy
+from lerobot_swr.run_context import running
 from lerobot_swr.training.configuration_training import OPTIONS_FILE, SeedsTrainConfig, is_begun
 from lerobot_swr.training.stacked_policies import StackedPolicies
+from lerobot_swr.whole_files import write_whole
 
 
 def check_options(config: SeedsTrainConfig) -> None:
@@ -51,10 +52,7 @@ def check_options(config: SeedsTrainConfig) -> None:
                 f"(see {OPTIONS_FILE}); resume with those, or choose another folder"
             )
         return
-    config.output_dir.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(options, indent=2))
-    os.replace(temporary, file)
+    write_whole(file, json.dumps(options, indent=2))
 
 
 def last_step(run: TrainPipelineConfig) -> int:
@@ -123,7 +121,7 @@ class SeedRuns:
     def __init__(self, config: SeedsTrainConfig, seeds: list[int], meta: LeRobotDatasetMetadata):
         self.runs = [config.of_seed(seed) for seed in seeds]
         self.step = last_step(self.runs[0])
-        self.policies: list[BCPolicy] = []
+        self.policies: list[StylePolicy] = []
         optimizers, scheduler = [], None
         for run in self.runs:
             policy = self._make_policy(run, meta)
@@ -136,7 +134,7 @@ class SeedRuns:
         self.preprocessor, self._postprocessor = self._make_processors(self.runs[0], meta)
         self.stack = StackedPolicies(self.policies, optimizers, scheduler, self.runs[0])
 
-    def _make_policy(self, run: TrainPipelineConfig, meta: LeRobotDatasetMetadata) -> BCPolicy:
+    def _make_policy(self, run: TrainPipelineConfig, meta: LeRobotDatasetMetadata) -> StylePolicy:
         assert run.seed is not None
         if self.step:
             path = checkpoint_folder(run, self.step) / PRETRAINED_MODEL_DIR
@@ -144,9 +142,9 @@ class SeedRuns:
             run.policy.pretrained_path = path
         assert run.policy is not None
         set_seed(run.seed)  # as lerobot-train does, so that the policy starts from the same weights
-        with resuming(bool(self.step)), training_on(run.dataset):
+        with running(run.dataset, resuming=bool(self.step)):
             policy = make_policy(run.policy, ds_meta=meta)
-        assert isinstance(policy, BCPolicy)
+        assert isinstance(policy, StylePolicy)
         return policy
 
     def _make_processors(

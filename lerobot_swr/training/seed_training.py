@@ -122,8 +122,9 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[],
         disable=count is not None,
     ) as bar:
         while runs.step < config.steps:
-            for drawn in _draw(runs, orders, frames, min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))):
-                window.append(runs.stack.step(drawn))
+            ahead = min(STEPS_AT_ONCE, _steps_to_save(config, runs.step))
+            for lesson in _lessons(runs, orders, frames, ahead):
+                window.append(runs.stack.step(lesson))
                 runs.step += 1
                 bar.update(len(seeds))
                 if count is not None:
@@ -177,17 +178,17 @@ def _prepared_frames(runs: SeedRuns, dataset: LeRobotDataset) -> dict[str, Tenso
     return {**frames, **{key: torch.from_numpy(value.copy()).to(device) for key, value in numbers.items()}}
 
 
-def _draw(
+def _lessons(
     runs: SeedRuns, orders: list[FrameOrder], frames: dict[str, Tensor], count: int
 ) -> Iterator[dict[str, Tensor]]:
-    """What the policies learn from in the next steps, at most `count`: each step's draws (K, B, ...)."""
+    """What the policies learn from in the next steps, at most `count`: each step's lessons (K, B, ...)."""
     parts: list[dict[str, Tensor]] = []
     n_steps = 0
     for policy, order in zip(runs.policies, orders, strict=True):
         rows = order.steps(runs.step, count).to(frames["index"].device)  # (S, B)
         n_steps = len(rows)
         batch = {key: value[rows.flatten()] for key, value in frames.items()}
-        parts.append(policy.draw(batch, n_steps))
+        parts.append(policy.draw(batch, n_steps).tensors([*policy.config.observation_keys, ACTION]))
     stacked = {
         key: torch.stack([part[key].unflatten(0, (n_steps, -1)) for part in parts], dim=1)  # (S, K, B, ...)
         for key in parts[0]

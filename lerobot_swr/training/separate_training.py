@@ -11,7 +11,7 @@ from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.scripts import lerobot_train
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_swr.configuration import resuming
+from lerobot_swr.run_context import running
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.exact_accelerator import exact_accelerator
 from lerobot_swr.training.memory import keep_freed_memory
@@ -73,7 +73,7 @@ def train_run(run: TrainPipelineConfig) -> None:
             with patch.object(sys, "argv", _resume_command(run)):
                 lerobot_train.train(accelerator=accelerator)
         else:
-            with resuming(False):  # whatever the command said of the other seeds
+            with running(run.dataset):  # whatever the command said of the other seeds
                 lerobot_train.train(run, accelerator=accelerator)
 
 

@@ -10,21 +10,23 @@ from torch.func import functional_call, vmap
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from lerobot_swr.policies.modeling_swr import BCPolicy
+from lerobot_swr.policies.lessons import Lesson
+from lerobot_swr.policies.row_adam import RowAdam
+from lerobot_swr.policies.style_policy import StylePolicy
 from lerobot_swr.training.early_updates import EarlyUpdates
 from lerobot_swr.training.parameter_blocks import ParameterBlock
 from lerobot_swr.training.traced_gradients import TracedGradients
 
 
-class _FrameLosses(nn.Module):
+class _LessonLoss(nn.Module):
     """A policy's loss as a module's call, in which `functional_call` can replace the parameters."""
 
-    def __init__(self, policy: BCPolicy):
+    def __init__(self, policy: StylePolicy):
         super().__init__()
         self.policy = policy
 
-    def forward(self, drawn: dict[str, Tensor]) -> Tensor:
-        return self.policy.frame_losses(drawn).mean()
+    def forward(self, lesson: dict[str, Tensor]) -> Tensor:
+        return self.policy.loss(Lesson.of_tensors(lesson))[0]
 
 
 class StackedPolicies:
@@ -41,7 +43,7 @@ class StackedPolicies:
 
     def __init__(
         self,
-        policies: Sequence[BCPolicy],
+        policies: Sequence[StylePolicy],
         optimizers: Sequence[Optimizer],
         scheduler: LRScheduler | None,
         config: TrainPipelineConfig,
@@ -56,7 +58,11 @@ class StackedPolicies:
             for group in names
         ]
         self._blocks = {name: block for group in self._groups for name, block in group.items()}
-        options = [{k: v for k, v in g.items() if k != "params"} for g in optimizers[0].param_groups]
+        left_out = ("params", "by_rows")  # of all policies together most rows move
+        options = [{k: v for k, v in g.items() if k not in left_out} for g in optimizers[0].param_groups]
+        for optimizer in optimizers:
+            if isinstance(optimizer, RowAdam):
+                optimizer.settle()
         self.optimizer = config.optimizer.build(
             [
                 {**o, "params": [block.flat for block in group.values()]}
@@ -74,10 +80,10 @@ class StackedPolicies:
             self.scheduler.load_state_dict(scheduler.state_dict())
             for options_, rate in zip(self.optimizer.param_groups, scheduler.get_last_lr(), strict=True):
                 options_["lr"] = rate
-        one = _FrameLosses(policies[0])
+        one = _LessonLoss(policies[0])
 
-        def loss(parameters: Mapping[str, Tensor], drawn: Mapping[str, Tensor]) -> Tensor:
-            return functional_call(one, {f"policy.{k}": v for k, v in parameters.items()}, (drawn,))
+        def loss(parameters: Mapping[str, Tensor], lesson: Mapping[str, Tensor]) -> Tensor:
+            return functional_call(one, {f"policy.{k}": v for k, v in parameters.items()}, (lesson,))
 
         stacked = {name: block.stacked for name, block in self._blocks.items()}
         self._gradients = TracedGradients(vmap(loss), stacked)
@@ -86,32 +92,32 @@ class StackedPolicies:
             self._early = EarlyUpdates(self.optimizer, self._groups)
             self._descent = TracedGradients(vmap(loss), stacked, self._early.consume)
 
-    def losses_and_gradients(self, drawn: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def losses_and_gradients(self, lesson: Mapping[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Each policy's loss and its gradient.
 
         Args:
-            drawn: What the policies' `draw` returned, stacked: (K, B, ...).
+            lesson: The tensors of what the policies' `draw` returned, stacked: (K, B, ...).
 
         Returns:
             (K,) losses, and parameter name to (K, ...) gradients.
         """
-        return self._gradients(drawn)
+        return self._gradients(lesson)
 
-    def step(self, drawn: Mapping[str, Tensor]) -> Tensor:
+    def step(self, lesson: Mapping[str, Tensor]) -> Tensor:
         """Train every policy on its own frames.
 
         Args:
-            drawn: As for `losses_and_gradients`.
+            lesson: As for `losses_and_gradients`.
 
         Returns:
             (K,) losses before the step.
         """
         if self._early is not None:
             self._early.begin()
-            losses, _ = self._descent(drawn)
+            losses, _ = self._descent(lesson)
             self._early.finish()
         else:
-            losses, gradients = self.losses_and_gradients(drawn)
+            losses, gradients = self.losses_and_gradients(lesson)
             for name, block in self._blocks.items():
                 block.flat.grad = block.rows(gradients[name])
             self._clip_gradients()
@@ -150,7 +156,7 @@ class StackedPolicies:
         return {"state": dict(enumerate(states)), "param_groups": groups}
 
 
-def _group_names(policy: BCPolicy, optimizer: Optimizer) -> list[list[str]]:
+def _group_names(policy: StylePolicy, optimizer: Optimizer) -> list[list[str]]:
     """Names of the parameters in each group of a policy's optimizer."""
     names = {id(parameter): name for name, parameter in policy.named_parameters()}
     return [[names[id(parameter)] for parameter in group["params"]] for group in optimizer.param_groups]

@@ -4,14 +4,17 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Self
 
 import torch
 from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_swr.dataset_statistics import Statistics
+from lerobot_swr.policies.backbones.backbone import check_same_shape
+from lerobot_swr.policies.backbones.modeling_mlp import ObservationEncoder
 from lerobot_swr.policies.baselines.averaging import moving_average
 from lerobot_swr.policies.baselines.configuration_baselines import (
     BesoConfig,
@@ -29,17 +32,17 @@ from lerobot_swr.policies.baselines.transformers import (
     Trunk,
     WindowGPT,
 )
-from lerobot_swr.policies.network import ObservationEncoder, check_same_shape
-from lerobot_swr.policies.state_policy import StatePolicy
-from lerobot_swr.policies.training_data import read_training_data
-from lerobot_swr.sampling import StepGenerator
+from lerobot_swr.policies.checked_loading import CheckedLoading
+from lerobot_swr.policies.training_data import adopt_features, read_training_data
+from lerobot_swr.random_streams import StepGenerator
+from lerobot_swr.run_context import RunContext
 from lerobot_swr.trajectories import Trajectories
 
 PAD = f"{OBS_STATE}_is_pad"
 ACTION_PAD = f"{ACTION}_is_pad"
 
 
-class WindowDiffusionPolicy(StatePolicy):
+class WindowDiffusionPolicy(CheckedLoading, PreTrainedPolicy):
     """Denoises actions, given a window of observations, with a transformer.
 
     Attributes:
@@ -67,7 +70,9 @@ class WindowDiffusionPolicy(StatePolicy):
         dataset_meta: LeRobotDatasetMetadata | None = None,
         **kwargs: Any,
     ):
-        super().__init__(config, dataset_meta)
+        super().__init__(config)
+        self.features_of = "environment" if dataset_meta is None else f"dataset {dataset_meta.root}"
+        adopt_features(config, dataset_meta)
         self.encoder = ObservationEncoder(config.observation_keys)
         self.network = self._make_network()
         self.average = moving_average(self.network, config.ema_decay)
@@ -79,7 +84,8 @@ class WindowDiffusionPolicy(StatePolicy):
         self.register_buffer("action_high", torch.full((config.action_dim,), torch.inf))
         self._has_dataset = dataset_meta is not None
         if dataset_meta is not None:
-            self._set_bounds(read_training_data(config, dataset_meta), dataset_meta.stats)
+            run = RunContext.current(dataset_meta)
+            self._set_bounds(read_training_data(config, dataset_meta, run), dataset_meta.stats)
         self.reset()
 
     @abstractmethod
@@ -144,6 +150,12 @@ class WindowDiffusionPolicy(StatePolicy):
             torch.manual_seed(seed)
             yield
 
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation."""
+        if mode and self.config.flush_denormal:
+            torch.set_flush_denormal(True)
+        return super().train(mode)
+
     def update(self) -> None:
         """Go on with the average; LeRobot calls this after every step of the optimizer."""
         self.average.update_parameters(self.network)
@@ -195,7 +207,7 @@ class WindowDiffusionPolicy(StatePolicy):
 
     # --- Checkpoints ---
 
-    def _translate_checkpoint(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+    def adapted(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """On a dataset, which need not be the checkpoint's, its own bounds of the actions hold."""
         if not self._has_dataset:
             return state

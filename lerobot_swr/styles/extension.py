@@ -2,24 +2,41 @@
 
 import logging
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 from lerobot.utils.constants import ACTION, OBS_STATE
-from torch import nn
+from torch import Tensor, nn
+from tqdm import tqdm
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
-from lerobot_swr.filters import names_in
-from lerobot_swr.policies.modeling_swr import ZBCPolicy
-from lerobot_swr.similarity import pairwise_distances
-from lerobot_swr.style_encoding import STARTS, encode_styles
-from lerobot_swr.style_table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
+from lerobot_swr.similarity import Similarity, similarity_of
+from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, encode_styles
+from lerobot_swr.styles.filters import names_in
+from lerobot_swr.styles.table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
 from lerobot_swr.trajectories import Trajectories
 
 CHUNK = 8  # episodes encoded at once; bounds memory
 
 logger = logging.getLogger(__name__)
+
+
+class StyledNetwork(Protocol):
+    """A style policy, as far as it is enlarged.
+
+    Attributes:
+        config: Its configuration.
+        styles: Its cookbook.
+    """
+
+    config: Any
+    styles: StyleCookbook
+
+    def predict(self, batch: dict[str, Any], style: Tensor) -> Tensor:
+        """π_θ(a | s, z): (B, A) normalised actions."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +57,7 @@ class EncodedStyles:
 
 
 def add_demonstrations(
-    policy: ZBCPolicy,
+    policy: StyledNetwork,
     preprocessor: Any,
     training: Trajectories,
     new: Trajectories,
@@ -75,28 +92,30 @@ def add_demonstrations(
             "name the new ones with --episodes=[...], or another dataset"
         )
     added = new.subset(chosen)
-    rows = None if same else _described(policy, added, robot_type)
+    described = None if same else _described(policy, added, robot_type)
 
     candidates = np.flatnonzero(trained)
-    states = training.states(policy.compared_keys()) + added.states(policy.compared_keys())
-    distances = pairwise_distances(states)[len(training) :]  # (E, N + E)
-    ranked = candidates[np.argsort(distances[:, candidates], axis=1, kind="stable")[:, :STARTS]]
+    both = training.followed_by(added, config.compared_keys)
+    similarity = similarity_of(both, config.compared_keys, Path(training.name))
+    rows = np.arange(len(training), len(both))  # the added ones
+    ranked, _ = similarity.nearest(rows, STARTS, candidates)
     starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
     keys = [*config.observation_keys, ACTION]
     raw = ({key: torch.from_numpy(episode[key]) for key in keys} for episode in added.episodes())
     frames = [{key: value for key, value in preprocessor(e).items() if key in keys} for e in raw]
     encoded, errors, nearest_errors = [], [], []
-    for i in range(0, len(frames), CHUNK):
-        part = slice(i, i + CHUNK)
-        found = encode_styles(policy.predict, frames[part], starts[part])
-        encoded.append(found[0])
-        errors.append(found[1])
-        nearest_errors.append(encode_styles(policy.predict, frames[part], starts[part, :1], steps=0)[1])
+    parts = [slice(i, i + CHUNK) for i in range(0, len(frames), CHUNK)]
+    with tqdm(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
+        for part in parts:
+            found = encode_styles(policy.predict, frames[part], starts[part], ENCODING_STEPS, bar.update)
+            encoded.append(found[0])
+            errors.append(found[1])
+            nearest_errors.append(encode_styles(policy.predict, frames[part], starts[part, :1], steps=0)[1])
 
     first = len(styles)
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))
     if not same:
-        _append_rows(policy, rows, distances, len(training))
+        _append_rows(policy, described, similarity, len(added))
     with torch.no_grad():
         styles.embedding.weight[numbers] = torch.cat(encoded)
     styles.trained[numbers] = 1
@@ -105,7 +124,7 @@ def add_demonstrations(
     )
 
 
-def _described(policy: ZBCPolicy, added: Trajectories, robot_type: str | None) -> StyleTable | None:
+def _described(policy: StyledNetwork, added: Trajectories, robot_type: str | None) -> StyleTable | None:
     """Rows of the table for new demonstrations; None where there is no table.
 
     Outcomes that they lack are dropped from the policy's table, unless a named filter needs them.
@@ -120,7 +139,7 @@ def _described(policy: ZBCPolicy, added: Trajectories, robot_type: str | None) -
         added = replace(added, tasks=("",) * len(added))
     rule = dataset_behavior_rule(config.behavior_rule, robot_type)
     metrics = load_style_metrics(config.style_metrics)
-    rows = make_style_table(added, np.zeros((len(added), len(added))), rule, metrics)
+    rows = make_style_table(added, np.zeros((len(added), 0)), rule, metrics)
     missing = set(table.columns) - set(rows.columns)
     if missing - OUTCOME_COLUMNS:
         raise ValueError(
@@ -141,18 +160,19 @@ def _described(policy: ZBCPolicy, added: Trajectories, robot_type: str | None) -
     return rows
 
 
-def _append_rows(policy: ZBCPolicy, rows: StyleTable | None, distances: np.ndarray, n_training: int) -> None:
+def _append_rows(
+    policy: StyledNetwork, described: StyleTable | None, similarity: Similarity, n_added: int
+) -> None:
     """Make room for new styles in the cookbook and describe them in the table."""
     config, styles = policy.config, policy.styles
-    first, n_added = len(styles), len(distances)
-    if styles.table is not None and rows is not None:
+    first = len(styles)
+    if styles.table is not None and described is not None:
+        n_training = len(similarity) - n_added
+        everyone = np.arange(len(similarity))
+        nearest, _ = similarity.nearest(everyone[n_training:], MAX_NEIGHBOURS, everyone)
         # Rows of the new demonstrations start at `first`, those of the training dataset at 0.
-        numbers = np.concatenate([np.arange(n_training), first + np.arange(n_added)])
-        neighbours = [
-            [int(j) for j in numbers[np.argsort(row, kind="stable")] if j != first + i][:MAX_NEIGHBOURS]
-            for i, row in enumerate(distances)
-        ]
-        styles.table = styles.table.extended(replace(rows, neighbours=neighbours))
+        numbers = np.concatenate([everyone[:n_training], first + np.arange(n_added)])
+        styles.table = styles.table.extended(replace(described, neighbours=numbers[nearest]))
     enlarged = nn.Embedding(first + n_added, config.style_dim, device=styles.embedding.weight.device)
     with torch.no_grad():
         enlarged.weight[:first] = styles.embedding.weight

@@ -1,27 +1,33 @@
 """The table of a checkpoint's demonstrations: one row per style, for filters, neighbours and named filters.
 
 It is made from the training dataset when a policy is created and travels with the checkpoint as
-``styles.json``, so that styles can be chosen where the dataset is not.
+``styles.parquet``, so that styles can be chosen where the dataset is not.
 """
 
 import json
 import logging
-import os
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from huggingface_hub import hf_hub_download
+import pyarrow as pa
+import pyarrow.parquet as pq
+from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 from lerobot.utils.constants import OBS_STATE, REWARD
 
-from lerobot_swr.behaviors import BehaviorRule
-from lerobot_swr.filters import Value, column_kind, select
+from lerobot_swr.behaviors import BehaviorRule, dataset_behavior_rule, load_style_metrics
+from lerobot_swr.similarity import Similarity
+from lerobot_swr.styles.filters import Value, column_kind, select
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.whole_files import replacing
 
-TABLE_FILE = "styles.json"
+TABLE_FILE = "styles.parquet"
+NEIGHBOURS = "nearest others"  # a column of the file; metrics have names without spaces
+FILTERS = b"filters"  # metadata of the file
 SUCCESS = "next.success"
 OUTCOMES = (REWARD, SUCCESS)
 OUTCOME_COLUMNS = frozenset({"return", "success"})
@@ -33,19 +39,19 @@ Metric = Callable[[Mapping[str, np.ndarray]], Value]
 logger = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StyleTable:
     """What is known of the demonstration behind each style.
 
     Attributes:
         columns: Name to N numbers, strings or truth values, one per episode.
-        neighbours: For each episode the others nearest to it by dissimilarity ν, nearest first, at most
-            `MAX_NEIGHBOURS`.
+        neighbours: (N, K) int32, for each episode the others nearest to it by dissimilarity ν, nearest first;
+            K is at most `MAX_NEIGHBOURS`, and -1 stands where there are fewer.
         filters: Named filters; a rollout whose task string is such a name draws from that filter's styles.
     """
 
     columns: dict[str, list[Value]]
-    neighbours: list[list[int]]
+    neighbours: np.ndarray
     filters: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -90,19 +96,36 @@ class StyleTable:
         """The table with the rows of `other` below, which has the same columns; filters are this table's."""
         columns = {name: values + other.columns[name] for name, values in self.columns.items()}
         columns["episode"] = list(range(len(self) + len(other)))
-        return replace(self, columns=columns, neighbours=self.neighbours + other.neighbours)
+        both = (self.neighbours, other.neighbours)
+        width = max(part.shape[1] for part in both)
+        padded = [np.pad(p, ((0, 0), (0, width - p.shape[1])), constant_values=-1) for p in both]
+        return replace(self, columns=columns, neighbours=np.concatenate(padded))
 
     def save(self, folder: Path) -> None:
         """Write the table into a checkpoint's folder, all or nothing."""
-        folder.mkdir(parents=True, exist_ok=True)
-        unfinished = folder / f".{TABLE_FILE}.{os.getpid()}"
-        unfinished.write_text(json.dumps(asdict(self)))
-        os.replace(unfinished, folder / TABLE_FILE)
+        flat = pa.array(self.neighbours.astype(np.int32).reshape(-1))
+        # A width of 0, of a single demonstration, is not kept by all readers of parquet.
+        rows = pa.FixedSizeListArray.from_arrays(flat, self.neighbours.shape[1] or 1) if len(flat) else None
+        columns: dict[str, Any] = {name: pa.array(values) for name, values in self.columns.items()}
+        if rows is not None:
+            columns[NEIGHBOURS] = rows
+        table = pa.table(columns).replace_schema_metadata({FILTERS: json.dumps(self.filters)})
+        with replacing(folder / TABLE_FILE) as unfinished:
+            pq.write_table(table, unfinished)
+
+    def upload(self, repo_id: str, private: bool | None) -> None:
+        """Put the table beside a checkpoint on the Hub."""
+        api = HfApi()
+        api.create_repo(repo_id=repo_id, private=private, exist_ok=True)
+        with TemporaryDirectory() as folder:
+            self.save(Path(folder))
+            file = Path(folder) / TABLE_FILE
+            api.upload_file(path_or_fileobj=file, path_in_repo=file.name, repo_id=repo_id)
 
 
 def make_style_table(
     trajectories: Trajectories,
-    distances: np.ndarray,
+    neighbours: np.ndarray,
     rule: BehaviorRule | None = None,
     metrics: Mapping[str, Metric] | None = None,
 ) -> StyleTable:
@@ -115,7 +138,7 @@ def make_style_table(
 
     Args:
         trajectories: The demonstrations.
-        distances: (N, N) distances of the demonstrations, or of any others in the columns.
+        neighbours: (N, K) the others nearest to each, see `StyleTable`.
         rule: Labels a demonstration.
         metrics: Name to user metric.
 
@@ -144,16 +167,29 @@ def make_style_table(
     named: dict[str, Metric] = {"behavior": rule} if rule is not None else {}
     for name, metric in {**named, **(metrics or {})}.items():
         columns[name] = _measured(name, metric, trajectories)
-    return StyleTable(columns, nearest_others(distances))
+    return StyleTable(columns, neighbours)
 
 
-def nearest_others(distances: np.ndarray) -> list[list[int]]:
-    """For each row the columns by growing distance, the row's own left out, at most `MAX_NEIGHBOURS`.
+def make_nearest_table(
+    trajectories: Trajectories,
+    similarity: Similarity,
+    behavior_rule: str | None,
+    style_metrics: str | None,
+    robot_type: str | None,
+) -> StyleTable:
+    """The table of a dataset's demonstrations.
 
-    ν divides a row by a constant, so its order is that of the distances.
+    Args:
+        trajectories: The demonstrations.
+        similarity: Their distances.
+        behavior_rule: ``module:function`` that labels them; None takes the rule of this package's datasets.
+        style_metrics: ``module:function`` of further columns, separated by commas.
+        robot_type: Of the dataset's metadata; finds the rule of this package's datasets.
     """
-    ranks = np.argsort(distances, axis=1, kind="stable")[:, : MAX_NEIGHBOURS + 1]
-    return [[j for j in row if j != i][:MAX_NEIGHBOURS] for i, row in enumerate(ranks.tolist())]
+    everyone = np.arange(len(trajectories))
+    neighbours, _ = similarity.nearest(everyone, MAX_NEIGHBOURS, everyone)
+    rule = dataset_behavior_rule(behavior_rule, robot_type)
+    return make_style_table(trajectories, neighbours, rule, load_style_metrics(style_metrics))
 
 
 def _measured(name: str, metric: Metric, trajectories: Trajectories) -> list[Value]:
@@ -198,6 +234,13 @@ def load_style_table(path: str | Path, **hub_options: Any) -> StyleTable | None:
         except (EntryNotFoundError, LocalEntryNotFoundError):
             return None
     try:
-        return StyleTable(**json.loads(file.read_text()))
-    except (ValueError, TypeError) as error:
+        table = pq.read_table(file)
+        filters = json.loads(table.schema.metadata[FILTERS])
+        neighbours = np.empty((len(table), 0), dtype=np.int32)
+        if NEIGHBOURS in table.column_names:
+            flat = table.column(NEIGHBOURS).combine_chunks().flatten().to_numpy()
+            neighbours = flat.reshape(len(table), -1)
+            table = table.drop_columns(NEIGHBOURS)
+        return StyleTable(table.to_pydict(), neighbours, filters)
+    except (pa.ArrowException, KeyError, TypeError, ValueError, OSError) as error:
         raise ValueError(f"{file}: damaged table ({error}); copy the checkpoint again") from error

@@ -10,9 +10,10 @@ import numpy as np
 from lerobot.utils.constants import OBS_STATE
 from plotly.offline import get_plotlyjs
 
-from lerobot_swr.filters import column_kind
-from lerobot_swr.style_table import StyleTable
+from lerobot_swr.styles.filters import column_kind
+from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.whole_files import write_whole
 
 MAX_PATH_POINTS = 120
 
@@ -103,8 +104,8 @@ def write_style_map(
         "paths": {i: np.round(p.astype(float), 4).tolist() for i, p in zip(with_path, paths, strict=True)},
         "path_axes": ["state 0", "state 1"] if plane else ["states, PC 1", "states, PC 2"],
     }
-    page = files("lerobot_swr").joinpath("style_map.html").read_text(encoding="utf-8")
+    page = files("lerobot_swr.styles").joinpath("map.html").read_text(encoding="utf-8")
     before, after = page.split("/*DATA*/")
     page = before.replace("/*PLOTLY*/", get_plotlyjs()) + as_script(data) + after
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
+    write_whole(path, page)

@@ -1,16 +1,16 @@
 """The style cookbook: one trainable style z per demonstration, and how styles are drawn at inference."""
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lerobot_swr.style_selection import StyleSelection
-from lerobot_swr.style_table import StyleTable
-
-StyleSampling = Literal["uniform", "stratified", "fixed"]
+from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling
+from lerobot_swr.styles.request import StyleRequest
+from lerobot_swr.styles.selection import StyleSelection
+from lerobot_swr.styles.table import StyleTable
 
 BLENDED = -1  # stands in `StyleCookbook.active` for a style that is no single episode's
 
@@ -20,13 +20,14 @@ class StyleCookbook(nn.Module):
 
     Attributes:
         embedding: `nn.Embedding` with one row per episode, (N, style_dim).
-        trained: (N,) uint8 buffer, 1 where the episode has been trained on (or encoded); only those styles
-            are ever drawn.
+        trained: (N,) uint8 buffer, 1 where the episode takes part in training, from the first step on (or
+            was encoded); only those styles are ever drawn.
         active: (B,) int64, the episodes whose styles the current rollout uses, `BLENDED` for a blend; None
             before its first action.
         table: What is known of each demonstration; None where the checkpoint has no table.
         selection: Which styles may be drawn.
-        blend: (i, j, share) makes every rollout use (1 − share) z_i + share z_j; None draws styles.
+        drawing: How they are drawn.
+        request: The styles that rollouts use instead; None draws.
 
     Args:
         num_episodes: N.
@@ -50,26 +51,40 @@ class StyleCookbook(nn.Module):
         selection: StyleSelection | None = None,
     ):
         super().__init__()
-        check_style_sampling(sampling)
+        self.drawing = StyleDrawing(sampling)
         self.embedding = nn.Embedding(num_episodes, style_dim)
         nn.init.normal_(self.embedding.weight, std=init_scale)
         self.trained: Tensor
         self.register_buffer("trained", torch.zeros(num_episodes, dtype=torch.uint8))
-        self.sampling = sampling
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
-        self.blend: tuple[int, int, float] | None = None
+        self._vectors: Tensor | None = None
+        self.request: StyleRequest | None = None
         self.restrict(selection or StyleSelection())
 
     def __len__(self) -> int:
         """Number of episodes, trained or not."""
         return self.embedding.num_embeddings
 
-    def mark_trained(self, episodes: Tensor) -> None:
-        """Remember, in every process, that the (B,) `episodes` were trained on."""
-        self.trained[episodes] = 1
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.all_reduce(self.trained, torch.distributed.ReduceOp.MAX)
+    def forward(self, episodes: Tensor) -> Tensor:
+        """(B, style_dim) styles of the (B,) `episodes`, to be trained."""
+        weight = self.embedding.weight
+        # Where an optimizer keeps a block for the gradient, few rows are added to it instead of all.
+        sparse = weight.is_leaf and weight.grad is not None and not weight.grad.is_sparse
+        return nn.functional.embedding(episodes, weight, sparse=sparse)
+
+    def check_trained(self, episodes: Tensor) -> None:
+        """Refuse frames of episodes that do not take part in training.
+
+        Raises:
+            ValueError: Naming them.
+        """
+        if not self.trained[episodes].all():
+            others = episodes[self.trained[episodes] == 0].unique().tolist()
+            raise ValueError(
+                f"a batch holds frames of episodes {others}, which the policy was not made to train on: name "
+                "them in --dataset.episodes or, in Python, create the policy within run_context.running(...)"
+            )
 
     # --- Choosing styles ---
 
@@ -96,12 +111,13 @@ class StyleCookbook(nn.Module):
             ValueError: If an episode of the selection does not exist.
         """
         selection.check_episodes(len(self))
-        self.selection, self.blend = selection, None
-        self._queues: dict[str | None, list[int]] = {}
+        self.selection, self.request = selection, None
+        self.restart()
 
     def restart(self) -> None:
-        """Begin anew where styles are drawn in turn: the next rollouts do not depend on earlier ones."""
-        self._queues = {}
+        """Begin anew where styles are taken in turn: the next rollouts do not depend on earlier ones."""
+        self.drawing.restart()
+        self._taken = 0
 
     def interpolate(self, i: int, j: int, share: float) -> None:
         """From the next rollout on use the blend (1 − share) z_i + share z_j, until `select` or `restrict`.
@@ -113,7 +129,28 @@ class StyleCookbook(nn.Module):
         StyleSelection(episodes=(i, j)).resolve(self._is_trained(), None)
         if not 0 <= share <= 1:
             raise ValueError(f"style_interpolate=[{i}, {j}, {share}]: the share must lie in 0 to 1")
-        self.blend = (i, j, share)
+        start, end = self.embedding.weight.detach()[[i, j]]
+        self.request = StyleRequest(vectors=torch.lerp(start, end, share)[None])
+
+    @contextmanager
+    def requested(self, request: StyleRequest) -> Iterator[None]:
+        """Within the block, from the next rollout on, use the styles of a request, in order.
+
+        Raises:
+            ValueError: If an episode has no style.
+        """
+        if request.episodes is not None:
+            asked = StyleSelection(episodes=request.episodes)
+            asked.check_episodes(len(self))
+            asked.resolve(self._is_trained(), None)
+        before = self.request
+        self.request = request
+        self.restart()
+        try:
+            yield
+        finally:
+            self.request = before
+            self.restart()
 
     def allowed(self, name: str | None = None) -> Tensor:
         """(M,) int64, the episodes whose styles may be drawn, also by the table's filter called `name`.
@@ -142,19 +179,8 @@ class StyleCookbook(nn.Module):
         drawn = torch.empty(batch_size, dtype=torch.int64, device=self.trained.device)
         for name in dict.fromkeys(names):
             places = [place for place, other in enumerate(names) if other == name]
-            drawn[places] = self._draw(len(places), name)
+            drawn[places] = self.drawing.draw(self.allowed(name), len(places), name)
         return drawn
-
-    def _draw(self, count: int, name: str | None) -> Tensor:
-        allowed = self.allowed(name)
-        if self.sampling == "uniform":
-            return allowed[torch.randint(len(allowed), (count,), device=allowed.device)]
-        queue = self._queues.setdefault(name, [])
-        while len(queue) < count:
-            order = torch.arange(len(allowed)) if self.sampling == "fixed" else torch.randperm(len(allowed))
-            queue += allowed.cpu()[order].tolist()
-        self._queues[name] = queue[count:]
-        return torch.tensor(queue[:count], device=allowed.device)
 
     # --- Rollouts ---
 
@@ -173,27 +199,22 @@ class StyleCookbook(nn.Module):
             ValueError: If the batch size changes within a rollout.
         """
         if self.active is None:
-            if self.blend is not None:
-                self.active = torch.full((batch_size,), BLENDED)
-            else:
-                self.active = self.draw(batch_size, tasks)
+            self.active, self._vectors = self._next(batch_size, tasks)
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
                 "call policy.reset() before a rollout with another number of environments"
             )
-        if self.blend is None:
-            return self.embedding(self.active)
-        i, j, share = self.blend
-        start, end = self.embedding.weight[[i, j]]
-        return torch.lerp(start, end, share).expand(batch_size, -1)
+        return self.embedding(self.active) if self._vectors is None else self._vectors
 
-
-def check_style_sampling(sampling: str) -> None:
-    """Refuse unknown ways of drawing styles.
-
-    Raises:
-        ValueError: For anything but ``uniform``, ``stratified`` and ``fixed``.
-    """
-    if sampling not in ("uniform", "stratified", "fixed"):
-        raise ValueError(f"style_sampling={sampling!r}: expected 'uniform', 'stratified' or 'fixed'")
+    def _next(self, batch_size: int, tasks: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+        """(B,) episodes for a rollout; where styles are no episode's, `BLENDED` and (B, style_dim) styles."""
+        if self.request is None:
+            return self.draw(batch_size, tasks), None
+        places = self.request.places(self._taken, batch_size)
+        self._taken += batch_size
+        device = self.trained.device
+        if self.request.episodes is not None:
+            return torch.tensor(self.request.episodes, device=device)[places], None
+        assert self.request.vectors is not None
+        return torch.full((batch_size,), BLENDED), self.request.vectors.to(device)[places]

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from lerobot_swr.filters import Value, column_kind, describe_column
-from lerobot_swr.style_table import StyleTable
+from lerobot_swr.styles.filters import Value, column_kind, describe_column
+from lerobot_swr.styles.table import StyleTable
 
 BAR = 40
 BINS = 10

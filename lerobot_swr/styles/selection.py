@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lerobot_swr.filters import describe_columns, parse_filter
-from lerobot_swr.style_table import MAX_NEIGHBOURS, StyleTable
+from lerobot_swr.styles.filters import describe_columns, parse_filter
+from lerobot_swr.styles.table import MAX_NEIGHBOURS, StyleTable
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,8 @@ class StyleSelection:
             raise ValueError("no style has been trained yet: train the policy, or load a trained checkpoint")
         allowed = np.flatnonzero(trained).tolist()
         if self.like is not None:
-            near = [
-                i for i in self._table(table, f"style_like={self.like}").neighbours[self.like] if trained[i]
-            ]
+            others = self._table(table, f"style_like={self.like}").neighbours[self.like].tolist()
+            near = [i for i in others if i >= 0 and trained[i]]
             allowed = [i for i in (self.like,) if trained[i]] + near[: self.neighbours]
         if self.episodes is not None:
             untrained = [i for i in self.episodes if not trained[i]]

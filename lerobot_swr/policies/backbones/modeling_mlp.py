@@ -1,10 +1,12 @@
-"""The network: observation encoder, style, trunk and action head, each replaceable on its own."""
+"""The backbone ``mlp``: a deterministic policy of the current observation, fitted by squared error."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
+
+from lerobot_swr.policies.backbones.backbone import Backbone, squared_errors, weighted_mean
 
 
 class ObservationEncoder(nn.Module):
@@ -49,14 +51,13 @@ class Trunk(nn.Module):
         return hidden
 
 
-class ActionNetwork(nn.Module):
-    """π_θ(a | s, z): the mean of a Gaussian of fixed variance, i.e. a deterministic policy.
+class MLPBackbone(Backbone):
+    """π_θ(a | s, z) as the mean of a Gaussian of fixed variance, i.e. a deterministic policy.
 
     Args:
-        observation_keys: Names of the observations.
-        observation_dim: Their dimensions together.
+        observations: Names of the observations to their dimensions, in order.
         style_dim: Dimension of z; 0 for a policy without styles.
-        action_dim: Dimension of the action.
+        action_dim: A.
         hidden_dim: Width of every hidden layer.
         num_hidden: Number of hidden layers.
         residual: Whether hidden layers are residual.
@@ -64,8 +65,7 @@ class ActionNetwork(nn.Module):
 
     def __init__(
         self,
-        observation_keys: Sequence[str],
-        observation_dim: int,
+        observations: Mapping[str, int],
         style_dim: int,
         action_dim: int,
         hidden_dim: int,
@@ -73,8 +73,8 @@ class ActionNetwork(nn.Module):
         residual: bool,
     ):
         super().__init__()
-        self.encoder = ObservationEncoder(observation_keys)
-        self.trunk = Trunk(observation_dim + style_dim, hidden_dim, num_hidden, residual)
+        self.encoder = ObservationEncoder(list(observations))
+        self.trunk = Trunk(sum(observations.values()) + style_dim, hidden_dim, num_hidden, residual)
         self.head = nn.Linear(hidden_dim, action_dim)
 
     def forward(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
@@ -84,15 +84,10 @@ class ActionNetwork(nn.Module):
             features = torch.cat([features, style], dim=-1)
         return self.head(self.trunk(features))
 
+    def loss(self, batch: dict[str, Tensor], style: Tensor | None, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Weighted squared error of the action, see `Backbone.loss`."""
+        return weighted_mean(squared_errors(self(batch, style), batch), weight)
 
-def check_same_shape(predicted: Tensor, actions: Tensor) -> None:
-    """Refuse to compare tensors that would be broadcast.
-
-    Raises:
-        ValueError: Naming both shapes.
-    """
-    if predicted.shape != actions.shape:
-        raise ValueError(
-            f"the batch's actions have shape {list(actions.shape)}, those predicted {list(predicted.shape)}: "
-            "let the policy's preprocessor prepare the batch (make_pre_post_processors)"
-        )
+    def predict_action_chunk(self, batch: dict[str, Tensor], style: Tensor | None) -> Tensor:
+        """(B, 1, A): one action at a time."""
+        return self(batch, style).unsqueeze(1)

@@ -1,0 +1,7 @@
+"""What a style policy learns actions with: a `Backbone`, chosen by ``--policy.backbone.type``.
+
+* `backbone`: the contract, which knows neither a cookbook nor a similarity.
+* `registry`: the configurations to choose from. A new backbone is one class that fulfils the contract and one
+  configuration that is registered there and makes it; nothing else has to know of it.
+* `configuration_mlp`, `modeling_mlp`: a deep ReLU network, the paper's, and the default.
+"""

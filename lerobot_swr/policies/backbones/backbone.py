@@ -1,0 +1,78 @@
+"""The contract between a style policy and what it learns actions with."""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from lerobot.utils.constants import ACTION
+from torch import Tensor, nn
+
+
+class Backbone(nn.Module, ABC):
+    """π_θ(a | s, z): learns and predicts actions for observations and a style.
+
+    Where styles come from, whose style a frame teaches and how much the frame counts is decided before: a
+    backbone uses the styles and weights that it is given. It passes the loss's gradient on to the styles.
+    """
+
+    @abstractmethod
+    def loss(
+        self, batch: dict[str, Tensor], style: Tensor | None, weight: Tensor
+    ) -> tuple[Tensor, Tensor | None]:
+        """Training loss of a batch; a pure function of it and of the parameters.
+
+        Args:
+            batch: Normalised observations (B, ...) and ``action`` (B, ...).
+            style: (B, style_dim); None for a policy without styles.
+            weight: (B,) factor of each frame's loss.
+
+        Returns:
+            The mean weighted loss, and each frame's weighted loss (B,), None if they are not known singly.
+        """
+
+    @abstractmethod
+    def predict_action_chunk(self, batch: dict[str, Tensor], style: Tensor | None) -> Tensor:
+        """(B, K, A) normalised actions, now and next, for normalised observations (B, ...).
+
+        Styles of demonstrations that were not trained on are found by this function's gradient.
+        """
+
+    def select_action(self, batch: dict[str, Tensor], style: Tensor | None) -> Tensor:
+        """(B, A) normalised actions to take now; a backbone that executes chunks overrides it."""
+        return self.predict_action_chunk(batch, style)[:, 0]
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Parameters for the optimizer, with options of their own where they need some."""
+        return [{"params": list(self.parameters())}]
+
+    def reset(self) -> None:
+        """Start a rollout: forget what was planned."""
+
+
+def weighted_mean(losses: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """What `Backbone.loss` returns, of (B,) losses and weights."""
+    weighted = losses * weight
+    return weighted.mean(), weighted
+
+
+def squared_errors(predicted: Tensor, batch: dict[str, Tensor]) -> Tensor:
+    """(B,) squared error of (B, A) actions, mean over the action's dimensions.
+
+    Raises:
+        ValueError: If the batch's actions have another shape than those that are predicted, which would be
+            broadcast to each other.
+    """
+    check_same_shape(predicted, batch[ACTION])
+    return (predicted - batch[ACTION]).square().mean(dim=-1)
+
+
+def check_same_shape(predicted: Tensor, actions: Tensor) -> None:
+    """Refuse to compare tensors that would be broadcast.
+
+    Raises:
+        ValueError: Naming both shapes.
+    """
+    if predicted.shape != actions.shape:
+        raise ValueError(
+            f"the batch's actions have shape {list(actions.shape)}, those predicted {list(predicted.shape)}: "
+            "let the policy's preprocessor prepare the batch (make_pre_post_processors)"
+        )

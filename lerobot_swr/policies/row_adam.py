@@ -1,0 +1,148 @@
+"""Adam for an embedding of very many rows, of which a step sees few."""
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+FROM_ROWS = 10_000  # below, a step over all rows costs next to nothing
+SHARE_LEFT = 1e-3  # of a row's movement by its momentum, at which it is left alone
+
+
+class RowAdam(torch.optim.Adam):
+    """Fused Adam whose step costs what the rows cost that move, for parameters in groups with ``by_rows``.
+
+    A row that gets a gradient goes on moving by its momentum. When a thousandth of that movement is left, it
+    is left alone; what Adam would have done to its state meanwhile is made up for at its next gradient. So
+    rows move as under `torch.optim.Adam`, up to that thousandth.
+
+    Gradients of such a parameter are kept in one block of memory: a sparse gradient, that of
+    ``F.embedding(..., sparse=True)``, is added to it row by row. After any other gradient all rows are taken
+    for moving.
+
+    Args:
+        params: Parameter groups; in those with ``by_rows`` parameters are (N, d).
+        **options: Options of `torch.optim.Adam`.
+    """
+
+    def __init__(self, params: Any, **options: Any):
+        super().__init__(params, fused=True, **options)
+        self._touched: dict[Tensor, list[Tensor]] = {}  # rows that have a gradient
+        self._moving: dict[Tensor, deque[Tensor]] = {}  # rows touched in each of the last steps
+        for param in self._embeddings():
+            param.grad = torch.zeros_like(param)
+            self._touched[param] = []
+            param.register_hook(self._noting(param))
+
+    def _embeddings(self) -> list[Tensor]:
+        return [p for group in self.param_groups if group.get("by_rows") for p in group["params"]]
+
+    def _noting(self, param: Tensor) -> Callable[[Tensor], None]:
+        def note(gradient: Tensor) -> None:
+            rows = gradient._indices()[0] if gradient.is_sparse else torch.arange(len(param))
+            self._touched[param].append(rows.to(param.device))
+
+        return note
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forget the gradients; those of embeddings become 0 where they are."""
+        kept = {param: param.grad for param in self._embeddings()}
+        super().zero_grad(set_to_none)
+        for param, gradient in kept.items():
+            param.grad = torch.zeros_like(param) if gradient is None else gradient
+            for rows in self._touched[param]:
+                param.grad[rows] = 0
+            self._touched[param] = []
+
+    @torch.no_grad()
+    def step(self, closure: Any = None) -> Any:
+        """A step of Adam."""
+        gradients = {param: param.grad for param in self._embeddings()}
+        for param in gradients:
+            param.grad = None  # Adam passes over it
+        result = super().step(closure)
+        for group in self.param_groups:
+            for param in group["params"] if group.get("by_rows") else ():
+                param.grad = gradients[param]
+                self._step_rows(param, group)
+        return result
+
+    def _step_rows(self, param: Tensor, group: dict[str, Any]) -> None:
+        state, rest = self._prepared(param, group), _steps_to_rest(group)
+        state["step"] += 1
+        step = state["step"]
+        touched = self._touched[param]
+        rows = torch.cat(touched) if touched else torch.arange(0, device=param.device)
+        # Up to which step the rows' states are known; since then they decayed.
+        missed = (step - 1) - torch.minimum(state["moved"][rows] + (rest - 1), step - 1)
+        for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
+            state[name][rows] *= torch.pow(beta, missed)[:, None]
+        state["moved"][rows] = step
+        self._moving[param].append(rows)
+        moving = torch.cat(list(self._moving[param])).unique()  # in one order, however they came together
+        assert param.grad is not None
+        changed = (param, state["exp_avg"], state["exp_avg_sq"])
+        values, means, squares = [[tensor.index_select(0, moving)] for tensor in changed]
+        torch._fused_adam_(
+            values,
+            [param.grad.index_select(0, moving)],
+            means,
+            squares,
+            [],
+            [step],
+            lr=group["lr"],  # which a schedule changes
+            beta1=group["betas"][0],
+            beta2=group["betas"][1],
+            weight_decay=0.0,
+            eps=group["eps"],
+            amsgrad=False,
+            maximize=False,
+        )
+        for tensor, (value,) in zip(changed, (values, means, squares), strict=True):
+            tensor.index_copy_(0, moving, value)
+
+    def _prepared(self, param: Tensor, group: dict[str, Any]) -> dict[str, Tensor]:
+        """The parameter's state, new or as a checkpoint of this optimizer or of Adam has it."""
+        state, rest = self.state[param], _steps_to_rest(group)
+        if "exp_avg" not in state:
+            state["step"] = torch.zeros((), device=param.device)
+            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
+        if "moved" not in state:  # the step of a row's last gradient
+            state["moved"] = torch.full((len(param),), float(state["step"]), device=param.device)
+            state["moved"] -= (state["exp_avg"] == 0).all(dim=1) * (rest - 1.0)
+        if param not in self._moving:
+            age = (state["step"] - state["moved"]).long()
+            slots = [(age == steps).nonzero().squeeze(1) for steps in range(rest - 2, -1, -1)]
+            self._moving[param] = deque(slots if state["step"] > 0 else [], maxlen=rest)
+        return state
+
+    def load_state_dict(self, state_dict: Any) -> None:
+        """As any optimizer does; which groups are ``by_rows`` stays as it is."""
+        by_rows = [group.get("by_rows", False) for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        for group, value in zip(self.param_groups, by_rows, strict=True):
+            group["by_rows"] = value
+        self._moving = {}
+
+    @torch.no_grad()
+    def settle(self) -> None:
+        """Bring all rows' states up to now: they are then those of `torch.optim.Adam`."""
+        for group in self.param_groups:
+            for param in group["params"] if group.get("by_rows") else ():
+                if not self.state.get(param):
+                    continue
+                state, rest = self._prepared(param, group), _steps_to_rest(group)
+                missed = (state["step"] - (state["moved"] + (rest - 1))).clamp(min=0)
+                for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
+                    state[name] *= torch.pow(beta, missed)[:, None]
+                del state["moved"]
+        self._moving = {}
+
+
+def _steps_to_rest(group: dict[str, Any]) -> int:
+    """Steps with and after a gradient in which a row moves."""
+    momentum = group["betas"][0]
+    return 1 if momentum == 0 else max(1, math.ceil(math.log(SHARE_LEFT) / math.log(momentum)))

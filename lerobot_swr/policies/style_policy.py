@@ -1,0 +1,300 @@
+"""A style policy: a cookbook of styles, a backbone that acts by them, and the steps of a lesson."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Self, cast
+
+import torch
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from lerobot.utils.constants import ACTION, OBS_STATE
+from torch import Tensor
+
+from lerobot_swr.corrective.relative_actions import RelativeActions
+from lerobot_swr.policies import style_checkpoints
+from lerobot_swr.policies.checked_loading import CheckedLoading
+from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.dynamics import adopt_dynamics, make_relative_actions
+from lerobot_swr.policies.lessons import Balance, Correct, Lesson, LessonStep, Relabel, logged
+from lerobot_swr.policies.row_adam import FROM_ROWS
+from lerobot_swr.policies.training_data import TrainingData, adopt_features, make_sampler, make_table
+from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.held_out import HeldOutStyles
+from lerobot_swr.styles.table import load_style_table
+from lerobot_swr.trajectories import Trajectories
+
+HUB_OPTIONS = ("revision", "token", "cache_dir", "local_files_only", "force_download")
+
+
+class StylePolicy(CheckedLoading, PreTrainedPolicy):
+    """π_θ(a | s, z), with one trainable style z_i per demonstration τ_i.
+
+    ``zbc`` fits each demonstration with its own style (eq. 1); in ``wzbc`` similar demonstrations teach each
+    other's styles (algorithm 1, see `Relabel`); ``bc`` has no styles. They differ in their configurations
+    alone. A rollout draws one style per environment at its first action and keeps it to the end (eq. 2).
+
+    Args:
+        config: The policy's configuration.
+        dataset_meta: Metadata of the training dataset; given when the policy is trained, absent at inference.
+        **kwargs: Whatever else LeRobot's factory passes (``dataset_stats``).
+
+    Attributes:
+        backbone: π_θ.
+        styles: The cookbook {z_i}; ``bc`` has none.
+        relative: Translates between actions and the backbone's, where these are relative to the state.
+        balance: The first step of a lesson; None where there is no dataset.
+        correct: The second, with corrective labels.
+        relabel: The last, of ``wzbc``.
+        data: The training dataset; None at inference.
+
+    Raises:
+        ValueError: If the dataset's features, data or statistics are not usable, there is a single episode to
+            train ``wzbc`` on, or a resumed run's dataset is not the checkpoint's.
+    """
+
+    config_class = BCConfig
+    name = "style"  # LeRobot wants one of every class; policies have their own
+    config: BCConfig
+    styles: StyleCookbook
+
+    def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
+        super().__init__(config)
+        self._has_learned = False
+        self.features_of = "environment" if dataset_meta is None else f"dataset {dataset_meta.root}"
+        adopt_features(config, dataset_meta)
+        self.data: TrainingData | None = None
+        self.balance: Balance | None = None
+        if dataset_meta is not None:
+            self.data = data = TrainingData.read(config, dataset_meta)
+            self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
+            config.num_episodes, config.dataset_fingerprint = len(data.trajectories), data.fingerprint
+        observations = {key: config.dimensions[key] for key in config.observation_keys}
+        style_dim = config.style_dim if isinstance(config, ZBCConfig) else 0
+        self.backbone = config.backbone.make(observations, style_dim, config.action_dim)
+        self.has_styles = isinstance(config, ZBCConfig)
+        self.relative: RelativeActions | None = None
+        self.correct: Correct | None = None
+        self.relabel: Relabel | None = None
+        if isinstance(config, ZBCConfig):
+            self._add_styles(config)
+        if isinstance(config, WZBCConfig):
+            self.relabel = Relabel(None if self.data is None else make_sampler(config, self.data))
+
+    def _add_styles(self, config: ZBCConfig) -> None:
+        if config.num_episodes is None:
+            raise ValueError(
+                f"policy {self.name!r} keeps one style per episode of its dataset: create it with a dataset "
+                "(dataset_meta) or from a checkpoint (num_episodes)"
+            )
+        data, dynamics = self.data, None
+        if data is not None:
+            config.num_added_styles = 0 if data.is_new else config.num_added_styles
+            dynamics = adopt_dynamics(config, data)
+        self.styles = StyleCookbook(
+            config.num_episodes + config.num_added_styles,
+            config.style_dim,
+            config.style_init_scale,
+            config.style_sampling,  # type: ignore[arg-type]
+            config.style_selection,
+        )
+        self.held_out = HeldOutStyles(self.styles, data)
+        self.relative = make_relative_actions(config)
+        stream = None
+        if dynamics is not None and data is not None and self.balance is not None:
+            self.relative = dynamics.relative_actions(config)
+            stream = dynamics.corrective_stream(config, self.balance.factors.numpy())
+        if config.corrective != "none":
+            self.correct = Correct(stream)
+        if data is not None:
+            self.styles.trained[list(data.run.episodes)] = 1
+            self.styles.table = make_table(config, data)
+
+    @property
+    def trajectories(self) -> Trajectories:
+        """The training dataset.
+
+        Raises:
+            RuntimeError: If the policy was created without one.
+        """
+        if self.data is None:
+            raise RuntimeError("this needs the training dataset: create the policy with dataset_meta")
+        return self.data.trajectories
+
+    # --- Training ---
+
+    @property
+    def steps(self) -> list[LessonStep]:
+        """The steps that make a lesson of a batch, in order."""
+        steps: tuple[LessonStep | None, ...] = (self.balance, self.correct, self.relabel)
+        return [step for step in steps if step is not None]
+
+    def get_optim_params(self) -> Any:
+        """The backbone's parameters, and the styles with a learning rate of their own."""
+        groups = self.backbone.param_groups()
+        if isinstance(self.config, ZBCConfig):
+            rate = self.config.optimizer_lr * self.config.style_lr_scale
+            by_rows = {"by_rows": True} if len(self.styles) >= FROM_ROWS else {}
+            groups = [*groups, {"params": list(self.styles.parameters()), "lr": rate, **by_rows}]
+        return groups
+
+    def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
+        """Training loss of a batch of frames; in evaluation, under the styles that suit the episodes best.
+
+        Args:
+            batch: Normalised observations (B, ...), ``action`` (B, ...), ``episode_index`` (B,) and, where
+                the dataset has pauses, ``index`` (B,), the dataset's number of each frame.
+            reduction: ``mean``, or ``none`` for one loss per frame.
+
+        Returns:
+            The loss, scalar or (B,), and numbers to log.
+
+        Raises:
+            ValueError: If the backbone does not know the losses of single frames and these are asked for.
+        """
+        if self.training:
+            lesson = self.draw(batch)
+            mean, losses = self.loss(lesson)
+            numbers = logged(self.steps, lesson, losses)
+        else:
+            (mean, losses), numbers = self._held_out_loss(batch), {}
+        if reduction != "none":
+            return mean, numbers
+        if losses is None:
+            raise ValueError(
+                f"reduction='none': the backbone {self.config.backbone.type!r} knows the mean only"
+            )
+        return losses, numbers
+
+    def draw(self, batch: dict[str, Any], steps: int = 1) -> Lesson:
+        """What the loss of a batch is computed from, all random draws and bookkeeping included.
+
+        Args:
+            batch: As in `forward`; the frames of consecutive steps may come together, one after the other.
+            steps: Number of steps whose frames these are, as many of each.
+
+        Returns:
+            The lesson, whose actions are those that the backbone is to predict.
+        """
+        lesson = Lesson.of(batch)
+        if self.has_styles:
+            self.styles.check_trained(lesson.episode)
+        self._has_learned = True
+        for step in self.steps:
+            lesson = step(lesson, steps)
+        return replace(lesson, batch=self._as_outputs(lesson.batch))
+
+    def loss(self, lesson: Lesson) -> tuple[Tensor, Tensor | None]:
+        """Mean weighted loss of a lesson and each frame's (B,); a pure function of it and the parameters."""
+        style = None
+        if self.has_styles:
+            style = self.styles(lesson.episode)
+            style = torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
+        return self.backbone.loss(lesson.batch, style, lesson.weight)
+
+    def _held_out_loss(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
+        lesson = Lesson.of(batch)
+        if self.balance is not None:
+            lesson = self.balance(lesson)
+        style = self.held_out.styles(self.predict, lesson.episode) if self.has_styles else None
+        return self.backbone.loss(self._as_outputs(batch), style, lesson.weight)
+
+    def _as_outputs(self, batch: dict[str, Any]) -> dict[str, Any]:
+        """`batch` with actions as the backbone is to predict them."""
+        if self.relative is None:
+            return batch
+        return {**batch, ACTION: self.relative.encode(batch[ACTION], batch[OBS_STATE])}
+
+    def train(self, mode: bool = True) -> Self:
+        """Switch between training and evaluation; training makes encoded styles out of date."""
+        if mode and self.has_styles:
+            self.held_out.forget()
+        if mode and self.config.flush_denormal:
+            torch.set_flush_denormal(True)
+        return super().train(mode)
+
+    # --- Acting ---
+
+    def predict(self, batch: dict[str, Any], style: Tensor | None = None) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, ...) and styles (B, style_dim)."""
+        return self._as_actions(self.backbone.predict_action_chunk(batch, style)[:, 0], batch)
+
+    def _as_actions(self, outputs: Tensor, batch: dict[str, Any]) -> Tensor:
+        """(B, A) actions of what the backbone predicts."""
+        return outputs if self.relative is None else self.relative.decode(outputs, batch[OBS_STATE])
+
+    def reset(self) -> None:
+        """Start a rollout: the next action draws new styles, one per environment."""
+        self.backbone.reset()
+        if self.has_styles:
+            self.styles.end_rollout()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """(B, A) normalised actions for normalised observations (B, ...), one style per environment."""
+        return self._as_actions(self.backbone.select_action(batch, self._rollout_styles(batch)), batch)
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
+        """(B, K, A) normalised actions, now and next."""
+        chunk = self.backbone.predict_action_chunk(batch, self._rollout_styles(batch))
+        return torch.stack([self._as_actions(outputs, batch) for outputs in chunk.unbind(1)], dim=1)
+
+    def _rollout_styles(self, batch: dict[str, Any]) -> Tensor | None:
+        """(B, style_dim) styles of the rollout under way."""
+        if not self.has_styles:
+            return None
+        if self.data is not None and self.data.is_new and not self._has_learned:
+            raise ValueError(
+                f"this policy was created to be trained on {self.data.root}, which is not the dataset of "
+                f"its checkpoint, so its {len(self.styles)} styles are new; to act with the checkpoint's, "
+                "load it without dataset_meta (ds_meta), whatever dataset you evaluate on"
+            )
+        tasks = cast(str | list[str], batch.get("task", []))
+        n_envs = len(batch[OBS_STATE])
+        return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
+
+    # --- Checkpoints ---
+
+    @classmethod
+    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
+        """Load a checkpoint and its table of demonstrations; selections of styles are checked at once.
+
+        Raises:
+            ValueError: If the checkpoint is damaged, or the selection of styles is empty.
+        """
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        if policy.has_styles:
+            options = {key: kwargs[key] for key in HUB_OPTIONS if key in kwargs}
+            style_checkpoints.adopt_table(
+                policy.styles, load_style_table(pretrained_name_or_path, **options), policy.data
+            )
+            if policy.data is None:  # in training, styles to draw need not exist yet
+                style_checkpoints.select_styles(policy.styles, cast(ZBCConfig, policy.config))
+        return policy
+
+    def push_model_to_hub(self, cfg: TrainPipelineConfig, *args: Any, **kwargs: Any) -> None:
+        """As LeRobot does, and the table, whose kind of file LeRobot leaves out."""
+        if self.has_styles and self.styles.table is not None:
+            self.styles.table.upload(cast(str, self.config.repo_id), self.config.private)
+        # Last, because a remote run ends when it says that the model is there.
+        super().push_model_to_hub(cfg, *args, **kwargs)
+
+    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
+        super()._save_pretrained(save_directory, state_dict)
+        if self.has_styles and self.styles.table is not None:
+            self.styles.table.save(Path(save_directory))
+
+    def adapted(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
+        """What of a checkpoint's tensors is to be loaded: on another dataset, new styles are started.
+
+        Raises:
+            ValueError: If corrective labels are asked of a checkpoint that was trained without, to act.
+        """
+        if self.correct is not None and self.data is None:
+            style_checkpoints.check_corrective(state)
+        state = style_checkpoints.with_own_draws(self, state, self.data)
+        if self.data is not None and self.relative is not None:  # computed from the dataset
+            own = self.relative.state_dict().items()
+            state = {**state, **{f"relative.{key}": value for key, value in own}}
+        return style_checkpoints.with_own_styles(self.styles, state, self.data) if self.has_styles else state

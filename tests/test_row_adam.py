@@ -1,0 +1,126 @@
+"""Adam that steps over the rows that move: the same as Adam over all, at the cost of those rows."""
+
+import copy
+
+import pytest
+import torch
+from torch import nn
+
+from lerobot_swr.policies.row_adam import RowAdam
+
+ROWS, DIM = 300, 3
+
+
+class Model(nn.Module):
+    """An embedding of many rows, and a layer."""
+
+    def __init__(self):
+        super().__init__()
+        generator = torch.Generator().manual_seed(0)
+        self.table = nn.Parameter(torch.randn(ROWS, DIM, generator=generator))
+        self.layer = nn.Parameter(torch.randn(DIM, generator=generator))
+
+    def loss(self, rows: torch.Tensor, sparse: bool) -> torch.Tensor:
+        """Some loss of some rows."""
+        values = nn.functional.embedding(rows, self.table, sparse=sparse)
+        return ((values @ self.layer - rows / ROWS) ** 2).mean()
+
+
+def make(by_rows: bool, **options):
+    model = Model()
+    groups = [{"params": [model.layer]}, {"params": [model.table], "lr": 5e-2}]
+    if by_rows:
+        groups[1]["by_rows"] = True
+    make_optimizer = RowAdam if by_rows else torch.optim.Adam
+    return model, make_optimizer(groups, lr=1e-2, **options)
+
+
+def train(model, optimizer, steps: range) -> None:
+    """Four rows a step, some of them twice, some often and some once."""
+    for step in steps:
+        generator = torch.Generator().manual_seed(step)
+        rows = torch.randint(ROWS, (4,), generator=generator)
+        rows[1] = rows[0] if step % 5 == 0 else step % 7
+        for group in optimizer.param_groups:
+            group["lr"] *= 0.998  # a schedule
+        model.loss(rows, model.table.grad is not None).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+@pytest.mark.parametrize("betas", [(0.9, 0.999), (0.0, 0.99), (0.99, 0.9999)])
+def test_rows_move_as_under_adam(betas):
+    """After 400 steps, up to a thousandth of how far they moved; other parameters to the bit at first."""
+    (rows, by_rows), (dense, adam) = make(True, betas=betas), make(False, betas=betas)
+    start = dense.table.detach().clone()
+    train(rows, by_rows, range(2))
+    train(dense, adam, range(2))
+    assert torch.equal(rows.layer, dense.layer)
+    train(rows, by_rows, range(2, 400))
+    train(dense, adam, range(2, 400))
+    moved = (dense.table - start).abs()
+    assert (moved > 0).all(dim=1).sum() > 250
+    torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=2e-3 * float(moved.detach().max()))
+    torch.testing.assert_close(rows.layer, dense.layer, rtol=1e-3, atol=1e-4)
+
+
+def test_a_step_looks_at_the_rows_that_move_alone(monkeypatch):
+    """Those of the last 66 steps, in which 99.9 % of a gradient's movement is done."""
+    model, optimizer = make(True)
+    sizes, fused = [], torch._fused_adam_
+
+    def count(params, *others, **options):
+        sizes.append(params[0].shape)
+        fused(params, *others, **options)
+
+    monkeypatch.setattr(torch, "_fused_adam_", count)
+    for step in range(200):
+        model.loss(torch.tensor([step]), True).backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    rows = [shape[0] for shape in sizes if len(shape) == 2]
+    assert rows[:3] == [1, 2, 3]
+    assert set(rows[66:]) == {66}
+    assert model.table.grad.eq(0).all()
+
+
+def test_a_resumed_optimizer_goes_on_bit_for_bit():
+    """From its saved state, taken while some rows move, some rest and some never moved."""
+    (whole, optimizer), (resumed, other) = make(True), make(True)
+    train(whole, optimizer, range(150))
+    state = copy.deepcopy(optimizer.state_dict())
+    resumed.load_state_dict(whole.state_dict())
+    other.load_state_dict(state)
+    train(whole, optimizer, range(150, 300))
+    train(resumed, other, range(150, 300))
+    assert torch.equal(whole.table, resumed.table)
+    assert torch.equal(whole.layer, resumed.layer)
+
+
+def test_settled_states_are_adams_and_go_on_under_either():
+    """A run may change between this optimizer and Adam, in both directions."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    train(rows, by_rows, range(150))
+    train(dense, adam, range(150))
+    by_rows.settle()
+    settled, exact = by_rows.state[rows.table], adam.state[dense.table]
+    assert settled.keys() == exact.keys()
+    for key in settled:
+        torch.testing.assert_close(settled[key], exact[key], rtol=0, atol=2e-3 * float(exact[key].max()))
+    (rows, by_rows), (dense, _) = make(True), (dense, adam)
+    rows.load_state_dict(dense.state_dict())
+    by_rows.load_state_dict(copy.deepcopy(adam.state_dict()))
+    train(rows, by_rows, range(150, 300))
+    train(dense, adam, range(150, 300))
+    torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=2e-3)
+
+
+def test_dense_gradients_move_all_rows():
+    """For instance those that several processes exchange: then it is Adam to rounding."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for step in range(80):
+        for model, optimizer in ((rows, by_rows), (dense, adam)):
+            model.loss(torch.tensor([step % 7, 2 * step]), False).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    torch.testing.assert_close(rows.table, dense.table, rtol=1e-5, atol=1e-6)
