@@ -20,7 +20,7 @@ PartnerSampling = Literal["uniform", "weighted"]
 
 PARTNERS = 256  # nearest others that are drawn by their share; the rest are drawn uniformly
 MAX_INSPECTED_STYLES = 64
-LARGEST_FACTOR = 16.0  # by which a frame of the rest may weigh more than others
+LARGEST_FACTOR = 16.0  # by which a frame of the rest may weigh more than one drawn by its own share
 ROWS = 4096  # episodes whose shares are computed at once
 
 

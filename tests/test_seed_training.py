@@ -266,13 +266,27 @@ def test_a_fine_tuned_run_resumes_and_each_seed_draws_its_own_pairs(swr_train, s
     swr_train(*flags)
     expected = {seed: weights(tmp_path / "run" / f"seed_{seed}", 20) for seed in (1, 2)}
     for seed in (1, 2):
-        assert int(expected[seed]["draws.seed"]) == seed
+        assert int(expected[seed]["relabel.draws.seed"]) == seed
         assert len(expected[seed]["styles.embedding.weight"]) == 6
     shutil.rmtree(tmp_path / "run/seed_2/checkpoints/000020")
     swr_train(*flags[:-2], "--seeds=1,2,3", "--jobs=1", "--resume=true")
     for name, value in weights(tmp_path / "run/seed_2", 20).items():
         assert torch.equal(value, expected[2][name]), name
-    assert int(weights(tmp_path / "run/seed_3", 20)["draws.seed"]) == 3
+    assert int(weights(tmp_path / "run/seed_3", 20)["relabel.draws.seed"]) == 3
+
+
+def test_very_many_styles_resume(swr_train, small_maze, tmp_path, monkeypatch):
+    """Where single runs step styles by rows, a stacked run's checkpoint says so, and goes on to the same."""
+    monkeypatch.setattr("lerobot_swr.policies.style_policy.FROM_ROWS", 2)
+    flags = train_flags(
+        "zbc", small_maze, tmp_path / "run", 4, *SMALL, "--seeds=0", "--jobs=1", "--save_freq=2"
+    )
+    swr_train(*flags)
+    expected = weights(tmp_path / "run/seed_0", 4)
+    shutil.rmtree(tmp_path / "run/seed_0/checkpoints/000004")
+    swr_train(*flags, "--resume=true")
+    for name, value in weights(tmp_path / "run/seed_0", 4).items():
+        torch.testing.assert_close(value, expected[name], rtol=1e-5, atol=1e-7)
 
 
 def test_resuming_on_a_changed_dataset_is_refused(swr_train, small_maze, tmp_path, capfd):

@@ -23,6 +23,7 @@ Seeds that are trained as one (`lerobot_swr.training`) take `draw` of many steps
 To act, `select_action` draws a style per environment from the cookbook and asks the backbone.
 
 What comes from the training dataset is read in `training_data` when the policy is created; `dynamics` fits
-what corrective labels need; `held_out_styles` encodes episodes that are not trained on;
-`style_checkpoints` and `checked_loading` tell what of a checkpoint goes on.
+what corrective labels need; `lerobot_swr.styles.held_out` encodes episodes that are not trained on;
+`style_checkpoints` and `checked_loading` tell what of a checkpoint goes on. `optimizer_swr` optimizes
+all three; where there are very many styles, `row_adam` steps those that move.
 """

@@ -59,6 +59,7 @@ class StackedPolicies:
         ]
         self._blocks = {name: block for group in self._groups for name, block in group.items()}
         left_out = ("params", "by_rows")  # of all policies together most rows move
+        self._by_rows = [{k: g[k] for k in ("by_rows",) if k in g} for g in optimizers[0].param_groups]
         options = [{k: v for k, v in g.items() if k not in left_out} for g in optimizers[0].param_groups]
         for optimizer in optimizers:
             if isinstance(optimizer, RowAdam):
@@ -149,9 +150,11 @@ class StackedPolicies:
         """State of policy k's optimizer, as `Optimizer.state_dict` of a single one."""
         states: list[dict[str, Tensor]] = []
         groups = []
-        for group, options in zip(self._groups, self.optimizer.state_dict()["param_groups"], strict=True):
+        of_all = self.optimizer.state_dict()["param_groups"]
+        for group, options, by_rows in zip(self._groups, of_all, self._by_rows, strict=True):
             own = [block.state_of(self.optimizer.state[block.flat], k) for block in group.values()]
-            groups.append({**options, "params": list(range(len(states), len(states) + len(own)))})
+            places = list(range(len(states), len(states) + len(own)))
+            groups.append({**options, **by_rows, "params": places})
             states += own
         return {"state": dict(enumerate(states)), "param_groups": groups}
 
