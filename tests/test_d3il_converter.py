@@ -3,6 +3,7 @@
 import os
 import pickle
 import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -306,12 +307,25 @@ def test_wrong_folders_and_lists(tmp_path):
         recorded_recipe(tmp_path, "avoiding", dump(tmp_path / "list.pkl", {"a": 1}))
 
 
-def test_command_line(tmp_path, monkeypatch, capsys):
-    """`lerobot-swr-dataset --from_d3il` writes the dataset and prints its histogram."""
+def test_command_line(tmp_path, run_command, capsys):
+    """`lerobot-swr-dataset --from_d3il` writes the dataset, prints its histogram and replays it."""
+    pytest.importorskip("mujoco")
     dump(tmp_path / "in" / "a.pkl", aligning_recording())
-    arguments = [f"--from_d3il={tmp_path / 'in'}", "--task=aligning", f"--root={tmp_path / 'out'}"]
-    monkeypatch.setattr("sys.argv", ["lerobot-swr-dataset", *arguments])
-    main()
+    run_command(main, f"--from_d3il={tmp_path / 'in'}", "--task=aligning", f"--root={tmp_path / 'out'}")
     output = capsys.readouterr().out
     assert "1 episodes of d3il_human_aligning" in output
     assert "outside" in output
+    assert "replayed: 0 of 1 succeed" in output
+
+
+def test_without_the_simulator_the_command_says_what_to_install(tmp_path, run_command, capsys, monkeypatch):
+    """The dataset is written all the same."""
+    for name in [name for name in sys.modules if name.startswith("lerobot_swr.envs.d3il.")]:
+        if not name.endswith("configuration_d3il"):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    dump(tmp_path / "in" / "a.pkl", avoiding_recording())
+    run_command(main, f"--from_d3il={tmp_path / 'in'}", "--task=avoiding", f"--root={tmp_path / 'out'}")
+    assert "not replayed in the simulator" in (output := capsys.readouterr().out)
+    assert "pip install 'lerobot_policy_swr[d3il]'" in output
+    assert (tmp_path / "out" / "meta" / "info.json").is_file()

@@ -11,6 +11,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from lerobot.envs.factory import make_env, make_env_config
 from lerobot.envs.utils import NEW_ROLLOUT_OPTION
+from scipy.spatial.transform import Rotation
 
 import lerobot_swr  # noqa: F401  registers the environment type
 from lerobot_swr.envs.d3il import rendering
@@ -18,6 +19,7 @@ from lerobot_swr.envs.d3il.aligning import AligningEnv
 from lerobot_swr.envs.d3il.avoiding import AvoidingEnv
 from lerobot_swr.envs.d3il.behavior import aligning_behavior, avoiding_behavior
 from lerobot_swr.envs.d3il.layouts import FINISH_LINE_Y
+from lerobot_swr.envs.d3il.recorded_starts import vertical_turn
 
 TASKS = ("avoiding", "aligning")
 
@@ -117,6 +119,36 @@ def test_wrong_context_is_explained(value):
     """A malformed context names its key and the expected form."""
     with pytest.raises(ValueError, match=r"options\['target'\].*\[x, y, angle_rad\]"):
         AligningEnv().reset(options={"target": value})
+
+
+@pytest.mark.parametrize("env_class", [AvoidingEnv, AligningEnv])
+def test_an_episode_begins_where_a_recording_does(env_class):
+    """At rest in the usual start, one step after it, or at rest elsewhere, as the tool's position says."""
+    n = env_class().action_space.shape[0]
+    usual = env_class().reset(seed=0)[0]["agent_pos"]
+    moving = env_class()
+    moving.reset(seed=0)
+    moved = moving.step(np.full(n, 0.004))[0]["agent_pos"]
+    elsewhere = env_class(start_radius=0.05).reset(seed=0)[0]["agent_pos"]
+    for recorded in (usual, moved, elsewhere):
+        begun = env_class().reset(seed=0, options={"agent_pos": recorded})[0]["agent_pos"]
+        np.testing.assert_allclose(begun, recorded, atol=1e-6)
+
+
+def test_a_wrong_start_of_the_arm_is_explained():
+    """The message names the option and what it holds."""
+    with pytest.raises(ValueError, match=r"options\['agent_pos'\].*\[desired_x, desired_y, x, y\]"):
+        AvoidingEnv().reset(options={"agent_pos": [0.5, 0.1]})
+
+
+@pytest.mark.parametrize("angle", [-3.0, -0.4, 0.0, 1.2, 3.1])
+def test_the_turn_of_a_box_is_read_from_its_quaternion(angle):
+    """Also of one that is tilted a little; the sign of the quaternion does not matter."""
+    upright = np.array([np.cos(angle / 2), 0, 0, np.sin(angle / 2)])
+    assert vertical_turn(upright) == pytest.approx(angle)
+    assert vertical_turn(-upright) == pytest.approx(angle)
+    tilted = Rotation.from_euler("ZYX", [angle, 0.05, -0.1])
+    assert vertical_turn(tilted.as_quat(scalar_first=True)) == pytest.approx(angle)
 
 
 @pytest.mark.parametrize("env_class", [AvoidingEnv, AligningEnv])

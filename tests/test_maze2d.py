@@ -175,3 +175,25 @@ def test_bad_options_are_named_before_anything_starts(options, message):
     """The configuration refuses them, so no environment or worker is started."""
     with pytest.raises(ValueError, match=message):
         Maze2DEnvConfig(**options)
+
+
+def test_an_episode_starts_where_it_is_told_to():
+    """One agent by `reset(options=...)`, single agents of a batch by Gymnasium's mask; the others stay."""
+    env = gym.make(Maze2DEnvConfig().gym_id).unwrapped
+    np.testing.assert_allclose(env.reset(options={"agent_pos": [0.2, 0.6]})[0]["agent_pos"], [0.2, 0.6])
+    batch = Maze2DEnvConfig(start="random", episode_length=3).create_rollout_env(3)
+    before = batch.reset(seed=0)[0]["agent_pos"]
+    batch.step(np.zeros((3, 2)))
+    mask = np.array([False, True, False])
+    after = batch.reset(seed=5, options={"agent_pos": [0.2, 0.6], "reset_mask": mask})[0]["agent_pos"]
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    np.testing.assert_allclose(after[1], [0.2, 0.6])
+    batch.step(np.zeros((3, 2)))
+    np.testing.assert_array_equal(batch.step(np.zeros((3, 2)))[3], ~mask)
+
+
+@pytest.mark.parametrize("start", [[0.5], [0.5, 1.2], [0.5, np.nan]])
+def test_a_start_outside_of_the_maze_is_refused(start):
+    """The message names the option."""
+    with pytest.raises(ValueError, match=r"options\['agent_pos'\].*x and y in the maze"):
+        Maze2DEnvConfig().create_rollout_env(2).reset(options={"agent_pos": start})

@@ -16,8 +16,7 @@ _FINGER_FORCE_AT_RESET = 0.9572
 
 SETTLING_STEPS = 80
 """Control periods in which the arm moves to another place and comes to rest there."""
-_PATIENCE = 10  # control periods without coming nearer, after which the tool has passed a place
-_SAME_PLACE = 1e-6  # metres
+_SAME_PLACE = 6  # decimals of a metre that have to agree; recordings have float32's
 
 
 class ArmSimulation:
@@ -62,35 +61,24 @@ class ArmSimulation:
             mujoco.mj_step(model, data)
 
     def approach(self, desired: np.ndarray, actual: np.ndarray) -> None:
-        """Move from rest towards a desired tool position, until the tool comes nearest to an actual one.
+        """Move from rest in the start pose to where a recording begins.
 
-        A recording may begin at rest in the arm's start pose, some control periods after it, or at rest
-        elsewhere; the actual position tells which.
+        It begins there, or one control period after the first move, or at rest elsewhere (whoever let the arm
+        move before recording waited for it): wherever the tool is nearest to the actual position.
 
         Args:
             desired: (3,) position to hold.
-            actual: (n,) first coordinates of the position to come near to.
+            actual: (n,) first coordinates of the tool's position.
         """
-        for _ in range(self._periods_until_near(desired, actual)):
-            self.advance(desired)
-
-    def _periods_until_near(self, desired: np.ndarray, actual: np.ndarray) -> int:
-        """Control periods after which `approach` ends, found out on a copy."""
         trial = ArmSimulation(self.model, copy.copy(self.data))
         trial._planned_joints[:] = self._planned_joints
-
-        def distance_to(place: np.ndarray) -> float:
-            return float(np.linalg.norm(trial.tool_position[: len(actual)] - place[: len(actual)]))
-
-        # Before anything moves the tool is only where the recording begins if nothing is to move.
-        best, nearest = 0, distance_to(actual) if distance_to(desired) < _SAME_PLACE else np.inf
-        for period in range(1, SETTLING_STEPS + 1):
-            if nearest < _SAME_PLACE or period > best + _PATIENCE:
-                break
-            trial.advance(desired)
-            if distance_to(actual) < nearest:
-                best, nearest = period, distance_to(actual)
-        return best
+        trial.advance(desired)
+        places = np.stack([self.tool_position, trial.tool_position, desired])
+        distances = np.linalg.norm(places[:, : len(actual)] - actual, axis=1)
+        nearest = distances.round(_SAME_PLACE).argmin()  # of equal ones the first
+        stays = not (desired - self.tool_position).round(_SAME_PLACE).any()
+        for _ in range((0 if stays else 1, 1, SETTLING_STEPS)[nearest]):
+            self.advance(desired)
 
     @property
     def tool_position(self) -> np.ndarray:
