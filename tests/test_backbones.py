@@ -114,8 +114,8 @@ def test_a_checkpoint_of_version_0_1_is_refused(make_tiny_policy, small_maze_met
     (folder / "config.json").write_text(json.dumps(stored))
     with pytest.raises(Exception, match="Couldn't instantiate class"):
         PreTrainedConfig.from_pretrained(folder)
-    told = capsys.readouterr().err.strip().splitlines()
-    assert told == [
+    told = capsys.readouterr().err.strip().splitlines()  # LeRobot's own messages, too
+    assert [line for line in told if line.startswith("error:")] == [
         "error: this zbc checkpoint was made by version 0.1, which this version does not read: train the "
         "policy anew, or use it with lerobot_policy_swr 0.1"
     ]

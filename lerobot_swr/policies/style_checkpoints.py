@@ -35,16 +35,16 @@ def with_own_draws(
     return {**state, **own} if starts else {**own, **state}
 
 
-def check_corrective(state: dict[str, Tensor]) -> None:
-    """Refuse to act with corrective labels from a checkpoint's tensors without.
+def check_corrective(corrective: str, state: dict[str, Tensor]) -> None:
+    """Refuse to act with the corrective labels that are asked for from a checkpoint without.
 
     Raises:
         ValueError: If it was trained without.
     """
     if "correct.draws.seed" not in state:
         raise ValueError(
-            "policy.corrective: this checkpoint was trained without corrective labels, which take effect in "
-            "training alone; leave the flag out, or train with it"
+            f"policy.corrective={corrective!r}: this checkpoint was trained without corrective labels, which "
+            "take effect in training alone; leave the flag out, or train with it"
         )
 
 

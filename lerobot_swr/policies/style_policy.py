@@ -292,7 +292,7 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             ValueError: If corrective labels are asked of a checkpoint that was trained without, to act.
         """
         if self.correct is not None and self.data is None:
-            style_checkpoints.check_corrective(state)
+            style_checkpoints.check_corrective(cast(ZBCConfig, self.config).corrective, state)
         state = style_checkpoints.with_own_draws(self, state, self.data)
         if self.data is not None and self.relative is not None:  # computed from the dataset
             own = self.relative.state_dict().items()
