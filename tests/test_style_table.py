@@ -229,6 +229,39 @@ def test_a_task_string_selects_the_named_filter_per_environment(checkpoint):
         drawn(reload(checkpoint, style_filter="behavior == '20'"), task=["left"] * 60)
 
 
+def test_a_changed_task_takes_effect_from_the_next_step(checkpoint):
+    """For the environment whose task names another filter, not for the others; text that names none keeps."""
+    reload(checkpoint).styles.table.with_filter("left", "behavior == '10'").save(checkpoint)
+    labels = reload(checkpoint).styles.table.columns["behavior"]
+    left, (right, other) = labels.index("10"), [i for i in range(6) if labels[i] == "20"]
+    policy = reload(checkpoint, style_episodes=f"[{left},{right},{other}]", style_sampling="fixed")
+
+    def act(*tasks):
+        policy.select_action({**make_batch(3), "task": list(tasks)})
+        return policy.styles.active.tolist()
+
+    policy.reset()
+    assert act("walk", "walk", "walk") == [left, right, other]
+    assert act("walk", "left", "walk") == [left, left, other]
+    assert act("walk", "walk", "walk") == [left, left, other]
+    policy.styles.request([right])
+    assert act("left", "left", "left") == [right, right, right]
+
+
+def test_filters_and_their_names_can_be_requested_in_a_rollout(checkpoint):
+    """Styles are drawn from what matches, whatever the flags allow."""
+    reload(checkpoint).styles.table.with_filter("left", "behavior == '10'").save(checkpoint)
+    policy = reload(checkpoint, style_episodes="[4]")
+    labels = policy.styles.table.columns["behavior"]
+    policy.reset()
+    for asked, expected in (("left", "10"), ("behavior == '20'", "20"), (StyleSelection(like=0), None)):
+        policy.select_action(make_batch(60))
+        policy.styles.request(asked)
+        policy.select_action(make_batch(60))
+        matching = {i for i, label in enumerate(labels) if expected in (None, label)}
+        assert set(policy.styles.active.tolist()) == matching
+
+
 def test_without_named_filters_the_drawing_is_as_it_was(checkpoint):
     """Task strings that name no filter leave the random numbers alone."""
     policy = reload(checkpoint)

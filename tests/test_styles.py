@@ -93,7 +93,7 @@ def test_a_request_is_served_in_order_and_then_forgotten():
             drawn.append(cookbook.active.tolist())
             torch.testing.assert_close(style, cookbook.embedding(cookbook.active))
     assert drawn == [[5, 0, 5], [0, 5, 0]]
-    assert cookbook.request is None
+    assert cookbook.asked is None
     with pytest.raises(ValueError, match=r"episodes \[1\] were not in the training data"):
         cookbook.requested(StyleRequest([1])).__enter__()
 
@@ -110,3 +110,72 @@ def test_styles_that_are_no_episodes_can_be_requested():
         StyleRequest([1], vectors)
     with pytest.raises(ValueError, match="empty request"):
         StyleRequest([])
+
+
+def test_a_request_changes_the_rollout_under_way_from_its_next_step():
+    """Environment k takes the k-th episode asked for; the next rollouts go on with those that follow."""
+    cookbook = make_cookbook()
+    cookbook.active_styles(3)
+    cookbook.request([5, 0])
+    assert torch.equal(cookbook.active_styles(3), cookbook.embedding(torch.tensor([5, 0, 5])))
+    assert torch.equal(cookbook.active_styles(3), cookbook.embedding(torch.tensor([5, 0, 5])))
+    cookbook.end_rollout()
+    cookbook.active_styles(3)
+    assert cookbook.active.tolist() == [0, 5, 0]
+    cookbook.request(2)
+    cookbook.active_styles(3)
+    assert cookbook.active.tolist() == [2, 2, 2]
+
+
+def test_a_request_before_the_first_step_holds_from_it():
+    """There is nothing to change yet."""
+    cookbook = make_cookbook()
+    cookbook.request(4)
+    cookbook.active_styles(2)
+    assert cookbook.active.tolist() == [4, 4]
+
+
+def test_vectors_can_be_requested_in_a_rollout():
+    """Styles that are no episode's, and then an episode's again."""
+    cookbook, vectors = make_cookbook(), torch.randn(2, 3)
+    cookbook.active_styles(3)
+    cookbook.request(vectors)
+    assert torch.equal(cookbook.active_styles(3), vectors[[0, 1, 0]])
+    cookbook.request(vectors[1])
+    assert torch.equal(cookbook.active_styles(3), vectors[[1, 1, 1]])
+    cookbook.request(3)
+    assert torch.equal(cookbook.active_styles(3), cookbook.embedding(torch.tensor([3, 3, 3])))
+
+
+def test_without_a_request_the_rollout_ends_as_it_is_and_the_next_draws():
+    """`request(None)` takes nothing away in mid-rollout."""
+    cookbook = make_cookbook(sampling="fixed", selection=StyleSelection(episodes=[1]))
+    cookbook.request(4)
+    cookbook.active_styles(2)
+    cookbook.request(None)
+    cookbook.active_styles(2)
+    assert cookbook.active.tolist() == [4, 4]
+    cookbook.end_rollout()
+    cookbook.active_styles(2)
+    assert cookbook.active.tolist() == [1, 1]
+
+
+@pytest.mark.parametrize(
+    ("styles", "message"),
+    [
+        ([2, 6], r"episodes \[6\] do not exist"),
+        (3, r"episodes \[3\] were not in the training data"),
+        ([], "empty request"),
+        (torch.zeros(1, 4), r"shape \[1, 4\].*have 3 dimensions"),
+        ("length >", "style_filter='length >'"),
+        ("length > 3", "no table of its demonstrations"),
+    ],
+)
+def test_a_request_that_cannot_be_served_changes_nothing(styles, message):
+    """It is refused when it is made, and the rollout goes on as before."""
+    cookbook = make_cookbook(trained=[0, 1, 2])
+    before = cookbook.active_styles(2)
+    with pytest.raises(ValueError, match=message):
+        cookbook.request(styles)
+    assert cookbook.asked is None
+    assert torch.equal(cookbook.active_styles(2), before)

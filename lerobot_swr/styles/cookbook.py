@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling
-from lerobot_swr.styles.request import StyleRequest
+from lerobot_swr.styles.request import StyleRequest, Styles, as_request
 from lerobot_swr.styles.selection import StyleSelection
 from lerobot_swr.styles.table import StyleTable
 
@@ -27,7 +27,7 @@ class StyleCookbook(nn.Module):
         table: What is known of each demonstration; None where the checkpoint has no table.
         selection: Which styles may be drawn.
         drawing: How they are drawn.
-        request: The styles that rollouts use instead; None draws.
+        asked: What rollouts use instead: styles, or a selection to draw from; None for neither.
 
     Args:
         num_episodes: N.
@@ -59,7 +59,9 @@ class StyleCookbook(nn.Module):
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
         self._vectors: Tensor | None = None
-        self.request: StyleRequest | None = None
+        self._names: list[str | None] = []
+        self._change = False
+        self.asked: StyleRequest | StyleSelection | None = None
         self.restrict(selection or StyleSelection())
 
     def __len__(self) -> int:
@@ -111,7 +113,7 @@ class StyleCookbook(nn.Module):
             ValueError: If an episode of the selection does not exist.
         """
         selection.check_episodes(len(self))
-        self.selection, self.request = selection, None
+        self.selection, self.asked, self._change = selection, None, False
         self.restart()
 
     def restart(self) -> None:
@@ -130,7 +132,40 @@ class StyleCookbook(nn.Module):
         if not 0 <= share <= 1:
             raise ValueError(f"style_interpolate=[{i}, {j}, {share}]: the share must lie in 0 to 1")
         start, end = self.embedding.weight.detach()[[i, j]]
-        self.request = StyleRequest(vectors=torch.lerp(start, end, share)[None])
+        self.asked = StyleRequest(vectors=torch.lerp(start, end, share)[None])
+
+    def request(self, styles: Styles) -> None:
+        """From the next step on act by these styles, in the rollout under way and in those that follow.
+
+        Policies that plan several actions at once take the styles at their next plan.
+
+        Args:
+            styles: An episode, or several that the environments take in turn; (K, style_dim) vectors, taken
+                in turn; the name of a filter of the table, a filter or a selection, to draw from; None goes
+                back to what is drawn without a request, from the next rollout on.
+
+        Raises:
+            ValueError: If an episode has no style, nothing matches, or the text is no filter.
+        """
+        asked = as_request(styles, {} if self.table is None else self.table.filters)
+        if asked is not None:
+            self._check(asked)
+        self.asked, self._change = asked, asked is not None
+        self.restart()
+
+    def _check(self, asked: StyleRequest | StyleSelection) -> None:
+        """Refuse a request that cannot be served."""
+        if isinstance(asked, StyleSelection):
+            asked.check_episodes(len(self))
+            asked.resolve(self._is_trained(), self.table)
+        elif asked.episodes is not None:
+            StyleSelection(episodes=asked.episodes).check_episodes(len(self))
+            StyleSelection(episodes=asked.episodes).resolve(self._is_trained(), None)
+        elif asked.vectors is not None and asked.vectors.shape[1:] != self.embedding.weight.shape[1:]:
+            raise ValueError(
+                f"styles of shape {list(asked.vectors.shape)}: this cookbook's have "
+                f"{self.embedding.embedding_dim} dimensions, give (K, {self.embedding.embedding_dim})"
+            )
 
     @contextmanager
     def requested(self, request: StyleRequest) -> Iterator[None]:
@@ -139,17 +174,14 @@ class StyleCookbook(nn.Module):
         Raises:
             ValueError: If an episode has no style.
         """
-        if request.episodes is not None:
-            asked = StyleSelection(episodes=request.episodes)
-            asked.check_episodes(len(self))
-            asked.resolve(self._is_trained(), None)
-        before = self.request
-        self.request = request
+        self._check(request)
+        before = self.asked
+        self.asked = request
         self.restart()
         try:
             yield
         finally:
-            self.request = before
+            self.asked = before
             self.restart()
 
     def allowed(self, name: str | None = None) -> Tensor:
@@ -158,7 +190,8 @@ class StyleCookbook(nn.Module):
         Raises:
             ValueError: If there are none, or a selected style was not trained.
         """
-        episodes = self.selection.resolve(self._is_trained(), self.table, name)
+        selection = self.asked if isinstance(self.asked, StyleSelection) else self.selection
+        episodes = selection.resolve(self._is_trained(), self.table, name)
         return torch.tensor(episodes, device=self.trained.device)
 
     def _is_trained(self) -> np.ndarray:
@@ -174,13 +207,18 @@ class StyleCookbook(nn.Module):
             tasks: One task string per episode; one that is the name of a filter of the table restricts the
                 draw to it. Empty for none.
         """
-        filters = {} if self.table is None else self.table.filters
-        names = [task if task in filters else None for task in tasks] or [None] * batch_size
+        names = self._filter_names(batch_size, tasks)
         drawn = torch.empty(batch_size, dtype=torch.int64, device=self.trained.device)
         for name in dict.fromkeys(names):
             places = [place for place, other in enumerate(names) if other == name]
             drawn[places] = self.drawing.draw(self.allowed(name), len(places), name)
         return drawn
+
+    def _filter_names(self, batch_size: int, tasks: Sequence[str]) -> list[str | None]:
+        """The named filter that each environment's task string is, if it is one."""
+        if self.table is None or self.asked is not None:  # a request stands above tasks
+            return [None] * batch_size
+        return [task if task in self.table.filters else None for task in tasks] or [None] * batch_size
 
     # --- Rollouts ---
 
@@ -191,6 +229,9 @@ class StyleCookbook(nn.Module):
     def active_styles(self, batch_size: int, tasks: Sequence[str] = ()) -> Tensor:
         """(B, style_dim) styles of the rollout under way, drawn at its first action and kept to its end.
 
+        They change before its end where styles are requested, and for an environment whose task string
+        becomes the name of another filter.
+
         Args:
             batch_size: B.
             tasks: As in `draw`.
@@ -200,21 +241,40 @@ class StyleCookbook(nn.Module):
         """
         if self.active is None:
             self.active, self._vectors = self._next(batch_size, tasks)
+            self._names, self._change = self._filter_names(batch_size, tasks), False
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
                 "call policy.reset() before a rollout with another number of environments"
             )
+        self._follow(batch_size, tasks)
         return self.embedding(self.active) if self._vectors is None else self._vectors
+
+    def _follow(self, batch_size: int, tasks: Sequence[str]) -> None:
+        """Change the active styles where a request or a task string says so since the last step."""
+        assert self.active is not None
+        if self._change:
+            self.active, self._vectors = self._next(batch_size, tasks)
+            self._change = False
+        elif self.asked is None:
+            names = self._filter_names(batch_size, tasks)
+            changed = [k for k, name in enumerate(names) if name is not None and name != self._names[k]]
+            if changed:
+                self.active = self.active.clone()
+                self.active[changed] = self.draw(len(changed), [tasks[k] for k in changed])
+                if self._vectors is not None:
+                    self._vectors[changed] = self.embedding(self.active[changed]).detach()
+            self._names = names
 
     def _next(self, batch_size: int, tasks: Sequence[str]) -> tuple[Tensor, Tensor | None]:
         """(B,) episodes for a rollout; where styles are no episode's, `BLENDED` and (B, style_dim) styles."""
-        if self.request is None:
+        asked = self.asked
+        if asked is None or isinstance(asked, StyleSelection):
             return self.draw(batch_size, tasks), None
-        places = self.request.places(self._taken, batch_size)
+        places = asked.places(self._taken, batch_size)
         self._taken += batch_size
         device = self.trained.device
-        if self.request.episodes is not None:
-            return torch.tensor(self.request.episodes, device=device)[places], None
-        assert self.request.vectors is not None
-        return torch.full((batch_size,), BLENDED), self.request.vectors.to(device)[places]
+        if asked.episodes is not None:
+            return torch.tensor(asked.episodes, device=device)[places], None
+        assert asked.vectors is not None
+        return torch.full((batch_size,), BLENDED), asked.vectors.to(device)[places]
