@@ -110,8 +110,8 @@ class ZBCConfig(BCConfig):
     corrective_relative: bool | None = None
 
     # --- Inference: which styles are drawn, one per episode of the environment ---
-    # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again) or
-    # "fixed" (in the given order).
+    # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again),
+    # "fixed" (in the given order) or "scene" (one whose demonstration began most like the rollout).
     style_sampling: str = "uniform"
     # Only the styles of these episodes of the training dataset; null allows all that were trained.
     style_episodes: list[int] | None = None
@@ -120,8 +120,9 @@ class ZBCConfig(BCConfig):
     style_filter: str | None = None
     # Only the styles of this episode and of those nearest to it by dissimilarity.
     style_like: int | None = None
-    # How many of the nearest others style_like allows.
-    style_neighbours: int = 5
+    # How many of the nearest others style_like allows, null for 5; without style_like, how many of those that
+    # began most like the rollout style_sampling=scene draws from, null for 1.
+    style_neighbours: int | None = None
     # [i, j, share]: every rollout uses the blend (1 - share) z_i + share z_j of two episodes' styles.
     style_interpolate: list[float] | None = None
 
@@ -171,7 +172,7 @@ class ZBCConfig(BCConfig):
                     f"style_interpolate={self.style_interpolate}: expected [i, j, share], two episodes and a "
                     "share from 0 to 1"
                 )
-            if selection != StyleSelection(neighbours=self.style_neighbours):
+            if selection != StyleSelection(neighbours=selection.neighbours):
                 raise ValueError(
                     f"style_interpolate={self.style_interpolate} fixes the style: leave out style_episodes, "
                     "style_filter and style_like"
@@ -180,7 +181,13 @@ class ZBCConfig(BCConfig):
     @property
     def style_selection(self) -> StyleSelection:
         """Which styles may be drawn."""
-        return StyleSelection(self.style_episodes, self.style_filter, self.style_like, self.style_neighbours)
+        neighbours = 5 if self.style_neighbours is None else self.style_neighbours
+        return StyleSelection(self.style_episodes, self.style_filter, self.style_like, neighbours)
+
+    @property
+    def near_scenes(self) -> int:
+        """Of how many styles that began most like the rollout one is drawn by scene."""
+        return 1 if self.style_like is not None else max(1, self.style_neighbours or 1)
 
 
 @PreTrainedConfig.register_subclass("wzbc")

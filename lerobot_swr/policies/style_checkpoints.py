@@ -58,6 +58,9 @@ def with_own_styles(
         state: The checkpoint's tensors.
         data: The training dataset; None at inference.
     """
+    # Checkpoints of before scenes were kept say nothing of them.
+    scenes = {f"styles.scenes.{key}": value for key, value in styles.scenes.state_dict().items()}
+    state = {**scenes, **state}
     if data is None:
         return state
     if not data.is_new:
@@ -109,5 +112,5 @@ def select_styles(styles: StyleCookbook, config: ZBCConfig) -> None:
     if config.style_interpolate is not None:
         i, j, share = config.style_interpolate
         styles.interpolate(int(i), int(j), share)
-    elif config.style_selection != StyleSelection(neighbours=config.style_neighbours):
+    elif config.style_selection != StyleSelection(neighbours=config.style_selection.neighbours):
         styles.allowed()

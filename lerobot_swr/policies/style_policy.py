@@ -97,6 +97,8 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             config.style_init_scale,
             config.style_sampling,  # type: ignore[arg-type]
             config.style_selection,
+            config.observation_dim,
+            config.near_scenes,
         )
         self.held_out = HeldOutStyles(self.styles, data)
         self.relative = make_relative_actions(config)
@@ -108,6 +110,7 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             self.correct = Correct(stream)
         if data is not None:
             self.styles.trained[list(data.run.episodes)] = 1
+            self.styles.scenes.fit(data.first_observations, data.scene_variation.shares > 0)
             self.styles.table = make_table(config, data)
 
     @property
@@ -252,7 +255,8 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             )
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
-        return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks)
+        scene = torch.cat([batch[key].reshape(n_envs, -1) for key in self.config.observation_keys], dim=1)
+        return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks, scene)
 
     # --- Checkpoints ---
 

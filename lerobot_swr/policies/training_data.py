@@ -1,7 +1,7 @@
 """What a policy takes from its training dataset: which features, their data, their statistics."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -22,10 +22,11 @@ from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.run_context import RunContext
 from lerobot_swr.sampling import PartnerSampler
+from lerobot_swr.scene_variation import SceneVariation, scene_variation
 from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.encoding import Frames
 from lerobot_swr.styles.table import OUTCOMES, StyleTable, make_nearest_table
-from lerobot_swr.trajectories import Trajectories, load_trajectories
+from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
 
 logger = logging.getLogger(__name__)
 
@@ -182,10 +183,26 @@ class TrainingData:
         """Distances of the episodes over the features that ν compares."""
         return similarity_of(self.trajectories, self.config.compared_keys, self.root)
 
+    @cached_property
+    def scene_variation(self) -> SceneVariation:
+        """How much scenes differ from episode to episode."""
+        keys = self.config.observation_keys
+        names = [name for group in dimension_names(self.meta, keys).values() for name in group]
+        return scene_variation(self.trajectories.joined(keys), self.trajectories.lengths, names)
+
+    @property
+    def first_observations(self) -> torch.Tensor:
+        """(N, d) how each episode begins, as the policy sees it."""
+        frames = self._prepared(self.trajectories.columns, self.trajectories.starts)
+        return torch.cat([frames[key] for key in self.config.observation_keys], dim=1)
+
     def frames(self, episode: int, rows: np.ndarray) -> Frames:
         """Some frames of an episode, as batches bring them."""
+        return self._prepared(self.trajectories.episode(episode), rows)
+
+    def _prepared(self, columns: Mapping[str, np.ndarray], rows: np.ndarray) -> Frames:
+        """Some rows of columns, as batches bring them."""
         preprocessor, _ = make_bc_pre_post_processors(self.config, self.meta.stats)
-        columns = self.trajectories.episode(episode)
         keys = [*self.config.observation_keys, ACTION]
         batch = preprocessor({key: torch.from_numpy(columns[key][rows]) for key in keys})
         return {key: batch[key] for key in keys}

@@ -2,13 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling
+from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling, one_of_each
 from lerobot_swr.styles.request import StyleRequest, Styles, as_request
+from lerobot_swr.styles.scenes import Scenes
 from lerobot_swr.styles.selection import StyleSelection
 from lerobot_swr.styles.table import StyleTable
 
@@ -27,6 +29,7 @@ class StyleCookbook(nn.Module):
         table: What is known of each demonstration; None where the checkpoint has no table.
         selection: Which styles may be drawn.
         drawing: How they are drawn.
+        scenes: How each demonstration began.
         asked: What rollouts use instead: styles, or a selection to draw from; None for neither.
 
     Args:
@@ -35,8 +38,10 @@ class StyleCookbook(nn.Module):
         init_scale: Standard deviation of the normal initialisation.
         sampling: ``uniform`` draws with replacement (eq. 2); ``stratified`` uses each allowed style once, in
             random order, before any is used again; ``fixed`` takes the allowed styles in their given order,
-            over and over.
+            over and over; ``scene`` takes one whose demonstration began most like the rollout does.
         selection: Which styles may be drawn; by default all that were trained.
+        scene_dim: Dimensions of an observation, for ``scene``.
+        near_scenes: How many of the allowed styles that began most like the rollout ``scene`` draws from.
 
     Raises:
         ValueError: For an unknown way of sampling, or a selection that is empty or out of range.
@@ -49,8 +54,11 @@ class StyleCookbook(nn.Module):
         init_scale: float,
         sampling: StyleSampling = "uniform",
         selection: StyleSelection | None = None,
+        scene_dim: int = 0,
+        near_scenes: int = 1,
     ):
         super().__init__()
+        self.scenes, self.near_scenes = Scenes(num_episodes, scene_dim), near_scenes
         self.drawing = StyleDrawing(sampling)
         self.embedding = nn.Embedding(num_episodes, style_dim)
         nn.init.normal_(self.embedding.weight, std=init_scale)
@@ -59,6 +67,7 @@ class StyleCookbook(nn.Module):
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
         self._vectors: Tensor | None = None
+        self._resolved: _Resolved | None = None
         self._names: list[str | None] = []
         self._change = False
         self.asked: StyleRequest | StyleSelection | None = None
@@ -158,9 +167,9 @@ class StyleCookbook(nn.Module):
         if isinstance(asked, StyleSelection):
             asked.check_episodes(len(self))
             asked.resolve(self._is_trained(), self.table)
-        elif asked.episodes is not None:
-            StyleSelection(episodes=asked.episodes).check_episodes(len(self))
-            StyleSelection(episodes=asked.episodes).resolve(self._is_trained(), None)
+        elif asked.named:
+            StyleSelection(episodes=asked.named).check_episodes(len(self))
+            StyleSelection(episodes=asked.named).resolve(self._is_trained(), None)
         elif asked.vectors is not None and asked.vectors.shape[1:] != self.embedding.weight.shape[1:]:
             raise ValueError(
                 f"styles of shape {list(asked.vectors.shape)}: this cookbook's have "
@@ -191,27 +200,37 @@ class StyleCookbook(nn.Module):
             ValueError: If there are none, or a selected style was not trained.
         """
         selection = self.asked if isinstance(self.asked, StyleSelection) else self.selection
-        episodes = selection.resolve(self._is_trained(), self.table, name)
-        return torch.tensor(episodes, device=self.trained.device)
+        known = self._resolved
+        if known is None or not known.holds(selection, self.table, self.trained):
+            self._resolved = known = _Resolved(selection, self.table, self.trained.clone(), {})
+        if name not in known.episodes:
+            episodes = selection.resolve(self._is_trained(), self.table, name)
+            known.episodes[name] = torch.tensor(episodes, device=self.trained.device)
+        return known.episodes[name]
 
     def _is_trained(self) -> np.ndarray:
         return self.trained.bool().cpu().numpy()
 
     # --- Drawing styles ---
 
-    def draw(self, batch_size: int, tasks: Sequence[str] = ()) -> Tensor:
+    def draw(self, batch_size: int, tasks: Sequence[str] = (), scene: Tensor | None = None) -> Tensor:
         """Draw the styles of `batch_size` episodes from torch's global generator: (B,) int64, by episode.
 
         Args:
             batch_size: B.
             tasks: One task string per episode; one that is the name of a filter of the table restricts the
                 draw to it. Empty for none.
+            scene: (B, scene_dim) normalised observations with which the episodes begin; only drawing by scene
+                needs them.
+
+        Raises:
+            ValueError: If drawing by scene is asked for without scenes.
         """
         names = self._filter_names(batch_size, tasks)
         drawn = torch.empty(batch_size, dtype=torch.int64, device=self.trained.device)
         for name in dict.fromkeys(names):
             places = [place for place, other in enumerate(names) if other == name]
-            drawn[places] = self.drawing.draw(self.allowed(name), len(places), name)
+            drawn[places] = self._draw_among(self.allowed(name), places, scene, name)
         return drawn
 
     def _filter_names(self, batch_size: int, tasks: Sequence[str]) -> list[str | None]:
@@ -220,13 +239,25 @@ class StyleCookbook(nn.Module):
             return [None] * batch_size
         return [task if task in self.table.filters else None for task in tasks] or [None] * batch_size
 
+    def _draw_among(
+        self, allowed: Tensor, places: list[int], scene: Tensor | None, name: str | None = None
+    ) -> Tensor:
+        """(P,) int64 of the (M,) `allowed`, for the episodes at the P `places` of the (B, c) scenes."""
+        if self.drawing.sampling != "scene":
+            return self.drawing.draw(allowed, len(places), name)
+        if scene is None:
+            raise ValueError("style_sampling='scene': this needs the observations with which rollouts begin")
+        return one_of_each(self.scenes.near(scene[places], allowed, self.near_scenes))
+
     # --- Rollouts ---
 
     def end_rollout(self) -> None:
-        """Forget the active styles; the next action draws new ones."""
+        """Forget the active styles; the next action draws new ones, by scene for what is seen then."""
         self.active = None
 
-    def active_styles(self, batch_size: int, tasks: Sequence[str] = ()) -> Tensor:
+    def active_styles(
+        self, batch_size: int, tasks: Sequence[str] = (), scene: Tensor | None = None
+    ) -> Tensor:
         """(B, style_dim) styles of the rollout under way, drawn at its first action and kept to its end.
 
         They change before its end where styles are requested, and for an environment whose task string
@@ -235,46 +266,71 @@ class StyleCookbook(nn.Module):
         Args:
             batch_size: B.
             tasks: As in `draw`.
+            scene: As in `draw`.
 
         Raises:
             ValueError: If the batch size changes within a rollout.
         """
         if self.active is None:
-            self.active, self._vectors = self._next(batch_size, tasks)
+            self.active, self._vectors = self._next(batch_size, tasks, scene)
             self._names, self._change = self._filter_names(batch_size, tasks), False
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
                 "call policy.reset() before a rollout with another number of environments"
             )
-        self._follow(batch_size, tasks)
+        self._follow(batch_size, tasks, scene)
         return self.embedding(self.active) if self._vectors is None else self._vectors
 
-    def _follow(self, batch_size: int, tasks: Sequence[str]) -> None:
+    def _follow(self, batch_size: int, tasks: Sequence[str], scene: Tensor | None) -> None:
         """Change the active styles where a request or a task string says so since the last step."""
         assert self.active is not None
         if self._change:
-            self.active, self._vectors = self._next(batch_size, tasks)
+            self.active, self._vectors = self._next(batch_size, tasks, scene)
             self._change = False
         elif self.asked is None:
             names = self._filter_names(batch_size, tasks)
             changed = [k for k, name in enumerate(names) if name is not None and name != self._names[k]]
             if changed:
                 self.active = self.active.clone()
-                self.active[changed] = self.draw(len(changed), [tasks[k] for k in changed])
+                self.active[changed] = self.draw(
+                    len(changed), [tasks[k] for k in changed], None if scene is None else scene[changed]
+                )
                 if self._vectors is not None:
                     self._vectors[changed] = self.embedding(self.active[changed]).detach()
             self._names = names
 
-    def _next(self, batch_size: int, tasks: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+    def _next(
+        self, batch_size: int, tasks: Sequence[str], scene: Tensor | None
+    ) -> tuple[Tensor, Tensor | None]:
         """(B,) episodes for a rollout; where styles are no episode's, `BLENDED` and (B, style_dim) styles."""
         asked = self.asked
         if asked is None or isinstance(asked, StyleSelection):
-            return self.draw(batch_size, tasks), None
+            return self.draw(batch_size, tasks, scene), None
         places = asked.places(self._taken, batch_size)
         self._taken += batch_size
         device = self.trained.device
-        if asked.episodes is not None:
+        if asked.vectors is not None:
+            return torch.full((batch_size,), BLENDED), asked.vectors.to(device)[places]
+        if asked.choices is None:
             return torch.tensor(asked.episodes, device=device)[places], None
-        assert asked.vectors is not None
-        return torch.full((batch_size,), BLENDED), asked.vectors.to(device)[places]
+        drawn = torch.empty(batch_size, dtype=torch.int64, device=device)
+        for choice in places.unique().tolist():
+            whose = torch.nonzero(places == choice).squeeze(1).tolist()
+            allowed = torch.tensor(asked.choices[choice], device=device)
+            drawn[whose] = self._draw_among(allowed, whose, scene, f"choice {choice}")
+        return drawn, None
+
+
+@dataclass(frozen=True, eq=False)
+class _Resolved:
+    """Which episodes were allowed by what, for it takes long to find that out of very many."""
+
+    selection: StyleSelection
+    table: StyleTable | None
+    trained: Tensor
+    episodes: dict[str | None, Tensor]
+
+    def holds(self, selection: StyleSelection, table: StyleTable | None, trained: Tensor) -> bool:
+        same = self.selection is selection and self.table is table and self.trained.shape == trained.shape
+        return same and self.trained.device == trained.device and torch.equal(self.trained, trained)

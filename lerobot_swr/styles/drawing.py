@@ -1,11 +1,13 @@
 """How styles are drawn for the episodes of an environment, of those that are allowed."""
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 
-StyleSampling = Literal["uniform", "stratified", "fixed"]
+StyleSampling = Literal["uniform", "stratified", "fixed", "scene"]
+SAMPLINGS = get_args(StyleSampling)
 
 
 class StyleDrawing:
@@ -14,7 +16,7 @@ class StyleDrawing:
     Args:
         sampling: ``uniform`` draws with replacement (eq. 2); ``stratified`` uses each allowed style once, in
             random order, before any is used again; ``fixed`` takes the allowed styles in their given order,
-            over and over.
+            over and over. ``scene`` is the cookbook's, which knows scenes.
 
     Raises:
         ValueError: For an unknown way of sampling.
@@ -47,11 +49,18 @@ class StyleDrawing:
         return torch.tensor(queue[:count], device=allowed.device)
 
 
+def one_of_each(choices: Sequence[Tensor]) -> Tensor:
+    """(B,) one of each of B tensors (M_b,), drawn uniformly."""
+    places = [torch.randint(len(choice), (1,), device=choice.device) for choice in choices]
+    return torch.cat([choice[place] for choice, place in zip(choices, places, strict=True)])
+
+
 def check_style_sampling(sampling: str) -> None:
     """Refuse unknown ways of drawing styles.
 
     Raises:
-        ValueError: For anything but ``uniform``, ``stratified`` and ``fixed``.
+        ValueError: For anything but ``uniform``, ``stratified``, ``fixed`` and ``scene``.
     """
-    if sampling not in ("uniform", "stratified", "fixed"):
-        raise ValueError(f"style_sampling={sampling!r}: expected 'uniform', 'stratified' or 'fixed'")
+    if sampling not in SAMPLINGS:
+        known = ", ".join(map(repr, SAMPLINGS[:-1]))
+        raise ValueError(f"style_sampling={sampling!r}: expected {known} or {SAMPLINGS[-1]!r}")

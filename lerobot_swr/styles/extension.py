@@ -103,6 +103,7 @@ def add_demonstrations(
     keys = [*config.observation_keys, ACTION]
     raw = ({key: torch.from_numpy(episode[key]) for key in keys} for episode in added.episodes())
     frames = [{key: value for key, value in preprocessor(e).items() if key in keys} for e in raw]
+    began = torch.stack([torch.cat([f[key][0] for key in config.observation_keys]) for f in frames])
     encoded, errors, nearest_errors = [], [], []
     parts = [slice(i, i + CHUNK) for i in range(0, len(frames), CHUNK)]
     with tqdm(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
@@ -116,6 +117,7 @@ def add_demonstrations(
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))
     if not same:
         _append_rows(policy, described, similarity, len(added))
+        styles.scenes.append(began)
     with torch.no_grad():
         styles.embedding.weight[numbers] = torch.cat(encoded)
     styles.trained[numbers] = 1

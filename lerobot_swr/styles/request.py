@@ -15,28 +15,36 @@ class StyleRequest:
     """Styles for the next episodes of the environment, taken in order, over and over.
 
     Attributes:
-        episodes: K episodes whose styles are asked for; None where `vectors` are.
-        vectors: (K, style_dim) styles that need not be any episode's; None where `episodes` are.
+        episodes: K episodes whose styles are asked for; None where another field says it.
+        vectors: (K, style_dim) styles that need not be any episode's.
+        choices: K lists of episodes; of each one style is drawn, in the cookbook's way (by scene, for one).
 
     Raises:
-        ValueError: If neither or both are given, or nothing is asked for.
+        ValueError: If not just one of them is given, or nothing is asked for.
     """
 
     episodes: Sequence[int] | None = None
     vectors: Tensor | None = None
+    choices: Sequence[Sequence[int]] | None = None
 
     def __post_init__(self) -> None:
         """Check that there is something to take."""
-        if (self.episodes is None) == (self.vectors is None):
-            raise ValueError("a request names episodes or gives vectors, one of the two")
-        if len(self) == 0:
+        if sum(asked is not None for asked in (self.episodes, self.vectors, self.choices)) != 1:
+            raise ValueError("a request names episodes (or choices of them) or gives vectors, one of the two")
+        if len(self) == 0 or any(len(choice) == 0 for choice in self.choices or ()):
             raise ValueError("an empty request: name an episode, or give a style")
+
+    @property
+    def named(self) -> list[int]:
+        """The episodes whose styles may be used; empty where vectors are given."""
+        return [*(self.episodes or ()), *(i for choice in self.choices or () for i in choice)]
 
     def __len__(self) -> int:
         """K."""
-        asked = self.vectors if self.episodes is None else self.episodes
-        assert asked is not None
-        return len(asked)
+        for asked in (self.episodes, self.vectors, self.choices):
+            if asked is not None:
+                return len(asked)
+        return 0
 
     def places(self, first: int, count: int) -> Tensor:
         """(count,) int64, places in the request of the episodes from `first` on."""
