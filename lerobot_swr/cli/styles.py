@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
@@ -25,6 +26,7 @@ from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.dataset_checks import check_dimensions
 from lerobot_swr.evaluation.checkpoint import Checkpoint, DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.policies.configuration_swr import ZBCConfig
+from lerobot_swr.policies.demonstration_frames import demonstration_frames
 from lerobot_swr.policies.style_policy import StylePolicy
 from lerobot_swr.policies.training_data import read_demonstrations
 from lerobot_swr.similarity import similarity_of
@@ -201,9 +203,18 @@ def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: StylePolicy) -> Non
     )
     training = _reference(cfg, checkpoint, needs_actions=True)
     new = read_demonstrations(policy.config, meta)
-    added = add_demonstrations(policy, checkpoint.preprocessor, training, new, cfg.episodes, meta.robot_type)
+    source = demonstration_frames(policy.config, meta, new, checkpoint.preprocessor)
+    added = add_demonstrations(
+        policy,
+        lambda i: source.frames(i, np.arange(new.lengths[i])),
+        training,
+        new,
+        cfg.episodes,
+        meta.robot_type,
+    )
     _save_new_checkpoint(cfg.checkpoint, policy, cfg.output_dir)
-    print("style  nearest demonstration  action error (under the nearest demonstration's style)")
+    error = "action error" if policy.config.traits.is_momentary else "loss"
+    print(f"style  nearest demonstration  {error} (under the nearest demonstration's style)")
     for row in zip(added.episodes, added.nearest, added.errors, added.errors_of_nearest, strict=True):
         print("{:5d}  {:21d}  {:.4f} ({:.4f})".format(*row))
     numbers = ",".join(map(str, added.episodes))

@@ -46,7 +46,9 @@ class CheckedLoading:
             ) from error
         state = model.adapted(state)
         own = model.state_dict()
-        missing = sorted(set(own) - set(state))
+        # Of tensors that share their memory, a file holds one.
+        shared = {own[key].data_ptr() for key in own.keys() & state.keys()}
+        missing = sorted(key for key in set(own) - set(state) if own[key].data_ptr() not in shared)
         misfits = [
             f"{key}: {tuple(state[key].shape)} in the file, {tuple(own[key].shape)} by config.json"
             for key in own.keys() & state.keys()

@@ -6,13 +6,21 @@ otherwise; `docs/method.md` gives the reasons and the flags of the paper's liter
 """
 
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from lerobot.configs import PreTrainedConfig
+from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 from lerobot.utils.constants import ACTION
 
 from lerobot_swr.configuration import tells_bad_values
+from lerobot_swr.dataset_statistics import Statistics
 from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
+from lerobot_swr.policies.backbones.own_traits import OwnTraits
+from lerobot_swr.policies.backbones.policy_traits import PolicyTraits
 from lerobot_swr.policies.backbones.registry import BackboneConfig
+from lerobot_swr.policies.backbones.style_place import AUTO, check_style_place
+from lerobot_swr.policies.backbones.traits import Traits
+from lerobot_swr.policies.processor_swr import Pipelines
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import check_beta, check_normalization
@@ -29,11 +37,21 @@ class BCConfig(StateConfig):
     it is defined.
     """
 
+    # Tells style policies from those that can be their backbones.
+    has_backbone: ClassVar[bool] = True
+    # Whether the backbone is given styles.
+    takes_style: ClassVar[bool] = False
+    schedules: ClassVar[tuple[str | None, ...]] = (None, "cosine", "constant")
+
     # --- Backbone: what learns the actions ---
-    # Its type and, beside it, the options of that type, e.g. --policy.backbone.hidden_dim=64.
+    # Its type (mlp, or any policy of LeRobot or of a plugin: act, diffusion, smolvla, ...) and, beside it,
+    # the options of that type, e.g. --policy.backbone.hidden_dim=64 or --policy.backbone.chunk_size=16.
     backbone: BackboneConfig = field(default_factory=MLPConfig)
 
     # --- Training ---
+    # "cosine" (to 0 at the run's last step, whatever --steps is) or "constant"; null takes the backbone's
+    # own, which for mlp is "cosine". The options optimizer_... are mlp's; other backbones have their own.
+    lr_schedule: str | None = None  # type: ignore[assignment]
     # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
     # uniformly, which favours long episodes).
     balance_episodes: bool = True
@@ -61,6 +79,7 @@ class BCConfig(StateConfig):
         """
         self._refuse_moved_options()
         super().__post_init__()
+        self.traits.settle(self)
 
     def _refuse_moved_options(self) -> None:
         moved = {key: getattr(self, key) for key in ("hidden_dim", "num_hidden", "residual")}
@@ -74,9 +93,69 @@ class BCConfig(StateConfig):
             now = " ".join(f"--policy.backbone.{key}={str(value).lower()}" for key, value in given.items())
             raise ValueError(f"policy.{', policy.'.join(given)}: belongs to the backbone now; give {now}")
 
+    # --- What the backbone says ---
+
+    @property
+    def traits(self) -> Traits:
+        """What is to be known of the backbone."""
+        backbone: Any = self.backbone
+        return PolicyTraits(backbone) if isinstance(backbone, PreTrainedConfig) else OwnTraits(backbone)
+
+    def __getattr__(self, name: str) -> Any:
+        """What LeRobot asks of a policy's configuration where it has it (dtype, chunk_size, rtc_config, ...).
+
+        Raises:
+            AttributeError: If the backbone's does not have it, either.
+        """
+        backbone = self.__dict__.get("backbone")
+        if name.startswith("__") or not isinstance(backbone, PreTrainedConfig):
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+        return getattr(backbone, name)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """What LeRobot tells a policy's configuration, and what is the backbone's option, is told to it."""
+        backbone = self.__dict__.get("backbone")
+        is_own = name in self.__dataclass_fields__ or hasattr(type(self), name)
+        if not is_own and isinstance(backbone, PreTrainedConfig) and hasattr(backbone, name):
+            setattr(backbone, name, value)
+        else:
+            super().__setattr__(name, value)
+
+    @property
+    def sees_images(self) -> bool:
+        """Whether the backbone looks at pictures."""
+        return self.traits.sees_images
+
+    @property
+    def observation_delta_indices(self) -> list[int] | None:
+        """Steps of the observations in a batch, as the backbone wants them."""
+        return self.traits.observation_delta_indices
+
+    @property
+    def action_delta_indices(self) -> list[int] | None:
+        """Steps of the actions in a batch, as the backbone wants them."""
+        return self.traits.action_delta_indices
+
+    @property
+    def reward_delta_indices(self) -> Any:
+        """Steps of the rewards in a batch, as the backbone wants them."""
+        return self.traits.reward_delta_indices
+
+    def get_optimizer_preset(self) -> OptimizerConfig:
+        """The backbone's optimizer."""
+        return self.traits.optimizer(self)
+
+    def get_scheduler_preset(self) -> LRSchedulerConfig | None:
+        """The learning rate's schedule: the backbone's, or what `lr_schedule` says."""
+        return self.traits.scheduler(self) if self.lr_schedule is None else super().get_scheduler_preset()
+
+    def make_pipelines(self, stats: Statistics | None, meta: Any | None) -> Pipelines:
+        """The backbone's pre- and post-processing."""
+        return self.traits.processors(self, stats, meta)
+
     @property
     def compared_keys(self) -> list[str]:
-        """The features over which ν compares demonstrations."""
+        """The features over which ν compares demonstrations; pictures are none."""
         return self.observation_keys
 
 
@@ -84,6 +163,8 @@ class BCConfig(StateConfig):
 @dataclass
 class ZBCConfig(BCConfig):
     """Style-conditioned behaviour cloning: one trainable style per demonstration (eq. 1 and 2)."""
+
+    takes_style: ClassVar[bool] = True
 
     # --- Styles ---
     # Dimension of a style z.
@@ -94,6 +175,12 @@ class ZBCConfig(BCConfig):
     # Learning rate of the styles, in units of optimizer_lr. A style learns from its own episode alone: with
     # the paper's 1 it lags behind the network.
     style_lr_scale: float = 5.0
+    # Learning rate of the styles; null takes style_lr_scale times optimizer_lr for mlp, 0.005 for other
+    # backbones, whose presets range from 1e-5 to 1e-3. Weight decay is 0 on styles.
+    style_lr: float | None = None
+    # Which observation of a LeRobot policy the style extends: "environment_state", "state", or "auto", the
+    # first of them through which it reaches the network. mlp does not need it.
+    style_key: str = AUTO
 
     # --- Corrective labels: beyond the paper, see docs/contracting.md ---
     # Teach every style the way back to its demonstration, from states beside it: "none" (the paper), "noise"
@@ -160,6 +247,9 @@ class ZBCConfig(BCConfig):
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
         if not self.style_lr_scale > 0:
             raise ValueError(f"style_lr_scale={self.style_lr_scale}: expected a number > 0; the paper uses 1")
+        if self.style_lr is not None and not self.style_lr > 0:
+            raise ValueError(f"style_lr={self.style_lr}: expected a number > 0")
+        check_style_place(self.style_key)
         check_style_sampling(self.style_sampling)
         if self.corrective not in ("none", "noise", "demos"):
             raise ValueError(f"corrective={self.corrective!r}: expected 'none', 'noise' or 'demos'")
@@ -177,6 +267,11 @@ class ZBCConfig(BCConfig):
                     f"style_interpolate={self.style_interpolate} fixes the style: leave out style_episodes, "
                     "style_filter and style_like"
                 )
+
+    @property
+    def styles_lr(self) -> float:
+        """Learning rate of the styles."""
+        return self.traits.style_lr(self) if self.style_lr is None else self.style_lr
 
     @property
     def style_selection(self) -> StyleSelection:
@@ -209,8 +304,8 @@ class WZBCConfig(ZBCConfig):
     partner_sampling: str = "weighted"
     # Divide distances by the farthest episode of each demonstration ("row", the paper) or of all ("global").
     similarity_normalization: str = "row"
-    # Features, in their own units, over which demonstrations are compared; null takes all observations that
-    # the network sees.
+    # Features, in their own units, over which demonstrations are compared; null takes all observations of
+    # numbers. Pictures are not compared.
     similarity_keys: list[str] | None = None
 
     @tells_bad_values

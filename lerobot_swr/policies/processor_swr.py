@@ -1,7 +1,8 @@
 """Pre- and post-processing of this package's policies: LeRobot's default pipelines, on vectors."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -18,7 +19,9 @@ from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 from lerobot_swr.dataset_statistics import Statistics
-from lerobot_swr.policies.state_config import StateConfig
+
+if TYPE_CHECKING:
+    from lerobot_swr.policies.state_config import StateConfig
 
 Pipelines = tuple[
     PolicyProcessorPipeline[dict[str, Any], dict[str, Any]],
@@ -93,9 +96,16 @@ class FloatVectorsProcessorStep(ProcessorStep):
         }
 
 
-def make_bc_pre_post_processors(config: StateConfig, dataset_stats: Statistics | None = None) -> Pipelines:
+def make_bc_pre_post_processors(
+    config: "StateConfig", dataset_stats: Statistics | None = None, dataset_meta: Any | None = None
+) -> Pipelines:
+    """The pipelines of the policy's backbone."""
+    return config.make_pipelines(dataset_stats, dataset_meta)
+
+
+def vector_pipelines(config: "StateConfig", dataset_stats: Statistics | None = None) -> Pipelines:
     """LeRobot's default pipelines, on vectors; constant dimensions are centred instead of being blown up."""
-    steps = make_default_policy_processor_steps(config, prepared_statistics(config, dataset_stats))
+    steps = make_default_policy_processor_steps(config, prepared_statistics(config.dimensions, dataset_stats))
     vectors = FloatVectorsProcessorStep(config.dimensions)
     return make_policy_processor_pipelines(
         # The step that adds a batch's dimension takes any tensor of one dimension for a single frame.
@@ -108,7 +118,7 @@ make_zbc_pre_post_processors = make_bc_pre_post_processors
 make_wzbc_pre_post_processors = make_bc_pre_post_processors
 
 
-def prepared_statistics(config: StateConfig, stats: Statistics | None) -> Statistics | None:
+def prepared_statistics(dimensions: Mapping[str, int], stats: Statistics | None) -> Statistics | None:
     """Statistics as vectors, with the standard deviation of constant dimensions set to 1.
 
     LeRobot divides by std + 1e-8, so the rounding error of a constant's mean would become an input or a
@@ -117,7 +127,7 @@ def prepared_statistics(config: StateConfig, stats: Statistics | None) -> Statis
     if stats is None:
         return None
     prepared = dict(stats)
-    for key, d in config.dimensions.items():
+    for key, d in dimensions.items():
         if key not in stats:
             continue
         values = {name: _as_vector(value, d) for name, value in stats[key].items() if name != "count"}

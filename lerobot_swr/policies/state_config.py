@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
@@ -9,12 +10,17 @@ from lerobot.optim.schedulers import CosineAnnealingWithWarmupSchedulerConfig
 from lerobot.utils.constants import ACTION, OBS_STATE
 
 from lerobot_swr.configuration import check_dataset_folder, tells_bad_values
+from lerobot_swr.dataset_statistics import Statistics
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
+from lerobot_swr.policies.processor_swr import Pipelines, vector_pipelines
 
 
 @dataclass
 class StateConfig(PreTrainedConfig):
     """A policy of low-dimensional observations; every field is documented where it is defined."""
+
+    # Values of lr_schedule.
+    schedules: ClassVar[tuple[str | None, ...]] = ("cosine", "constant")
 
     # --- Training ---
     # Adam's learning rate.
@@ -48,7 +54,7 @@ class StateConfig(PreTrainedConfig):
         check_dataset_folder()
         if not self.optimizer_lr > 0:
             raise ValueError(f"optimizer_lr={self.optimizer_lr}: expected a number > 0")
-        if self.lr_schedule not in ("cosine", "constant"):
+        if self.lr_schedule not in self.schedules:
             raise ValueError(f"lr_schedule={self.lr_schedule!r}: expected 'cosine' or 'constant'")
 
     def check_at_least_one(self, *keys: str) -> None:
@@ -60,6 +66,11 @@ class StateConfig(PreTrainedConfig):
         for key in keys:
             if getattr(self, key) < 1:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+
+    @property
+    def sees_images(self) -> bool:
+        """Whether the policy looks at pictures; else they are left out of its features."""
+        return False
 
     @property
     def observation_delta_indices(self) -> list[int] | None:
@@ -111,9 +122,21 @@ class StateConfig(PreTrainedConfig):
 
     def get_scheduler_preset(self) -> LRSchedulerConfig | None:
         """The learning rate's schedule; it ends with the run."""
-        if self.lr_schedule == "constant":
-            return None
+        return None if self.lr_schedule == "constant" else self.cosine_schedule()
+
+    @staticmethod
+    def cosine_schedule() -> LRSchedulerConfig:
+        """To 0 at the run's last step, whatever ``--steps`` is."""
         return CosineAnnealingWithWarmupSchedulerConfig(num_warmup_steps=0)
+
+    def make_pipelines(self, stats: Statistics | None, meta: Any | None) -> Pipelines:
+        """The policy's pre- and post-processing.
+
+        Args:
+            stats: The dataset's statistics.
+            meta: The dataset's metadata.
+        """
+        return vector_pipelines(self, stats)
 
     def validate_features(self) -> None:
         """Check that the dataset has what the policy needs.

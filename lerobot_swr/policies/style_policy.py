@@ -1,5 +1,6 @@
 """A style policy: a cookbook of styles, a backbone that acts by them, and the steps of a lesson."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, cast
@@ -17,9 +18,11 @@ from lerobot_swr.policies.checked_loading import CheckedLoading
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.dynamics import adopt_dynamics, make_relative_actions
 from lerobot_swr.policies.lessons import Balance, Correct, Lesson, LessonStep, Relabel, logged
+from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
 from lerobot_swr.policies.training_data import TrainingData, adopt_features, make_sampler, make_table
 from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.encoding import ENCODING_STEPS, ActionErrors, Frames, Imitation, encode_styles_by
 from lerobot_swr.styles.held_out import HeldOutStyles
 from lerobot_swr.styles.table import load_style_table
 from lerobot_swr.trajectories import Trajectories
@@ -68,10 +71,13 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
         if dataset_meta is not None:
             self.data = data = TrainingData.read(config, dataset_meta)
             self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
-            config.num_episodes, config.dataset_fingerprint = len(data.trajectories), data.fingerprint
-        observations = {key: config.dimensions[key] for key in config.observation_keys}
         style_dim = config.style_dim if isinstance(config, ZBCConfig) else 0
-        self.backbone = config.backbone.make(observations, style_dim, config.action_dim)
+        self.backbone = config.traits.make(config, style_dim, kwargs.get("dataset_stats"), dataset_meta)
+        if self.data is not None:
+            config.num_episodes, config.dataset_fingerprint = (
+                len(self.data.trajectories),
+                self.data.fingerprint,
+            )
         self.has_styles = isinstance(config, ZBCConfig)
         self.relative: RelativeActions | None = None
         self.correct: Correct | None = None
@@ -135,11 +141,13 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
     def get_optim_params(self) -> Any:
         """The backbone's parameters, and the styles with a learning rate of their own."""
         groups = self.backbone.param_groups()
-        if isinstance(self.config, ZBCConfig):
-            rate = self.config.optimizer_lr * self.config.style_lr_scale
-            by_rows = {"by_rows": True} if len(self.styles) >= FROM_ROWS else {}
-            groups = [*groups, {"params": list(self.styles.parameters()), "lr": rate, **by_rows}]
-        return groups
+        if not isinstance(self.config, ZBCConfig):
+            return groups
+        if isinstance(groups, dict):  # the optimizer gives rates by name
+            return {**groups, **{f"styles.{name}": value for name, value in self.styles.named_parameters()}}
+        by_rows = {"by_rows": True} if len(self.styles) >= FROM_ROWS else {}
+        styles = {"params": list(self.styles.parameters()), "lr": self.config.styles_lr, "weight_decay": 0.0}
+        return [*groups, {**styles, **by_rows}]
 
     def forward(self, batch: dict[str, Any], reduction: str = "mean") -> tuple[Tensor, dict[str, float]]:
         """Training loss of a batch of frames; in evaluation, under the styles that suit the episodes best.
@@ -155,19 +163,19 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
         Raises:
             ValueError: If the backbone does not know the losses of single frames and these are asked for.
         """
-        if self.training:
-            lesson = self.draw(batch)
-            mean, losses = self.loss(lesson)
-            numbers = logged(self.steps, lesson, losses)
+        lesson = self.draw(batch) if self.training else self._held_out_lesson(batch)
+        style = self._taught(lesson) if self.training else self._held_out_styles(batch)
+        if reduction == "none":
+            losses = self.backbone.frame_losses(lesson.batch, style, lesson.weight)
+            if losses is None:
+                raise ValueError(
+                    f"reduction='none': the backbone {self.config.backbone.type!r} knows the mean only"
+                )
+            result = losses
         else:
-            (mean, losses), numbers = self._held_out_loss(batch), {}
-        if reduction != "none":
-            return mean, numbers
-        if losses is None:
-            raise ValueError(
-                f"reduction='none': the backbone {self.config.backbone.type!r} knows the mean only"
-            )
-        return losses, numbers
+            result, losses = self.backbone.loss(lesson.batch, style, lesson.weight)
+        numbers = dict(self.backbone.numbers)
+        return result, {**numbers, **(logged(self.steps, lesson, losses) if self.training else {})}
 
     def draw(self, batch: dict[str, Any], steps: int = 1) -> Lesson:
         """What the loss of a batch is computed from, all random draws and bookkeeping included.
@@ -189,18 +197,44 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
 
     def loss(self, lesson: Lesson) -> tuple[Tensor, Tensor | None]:
         """Mean weighted loss of a lesson and each frame's (B,); a pure function of it and the parameters."""
-        style = None
-        if self.has_styles:
-            style = self.styles(lesson.episode)
-            style = torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
-        return self.backbone.loss(lesson.batch, style, lesson.weight)
+        return self.backbone.loss(lesson.batch, self._taught(lesson), lesson.weight)
 
-    def _held_out_loss(self, batch: dict[str, Any]) -> tuple[Tensor, Tensor | None]:
+    def _taught(self, lesson: Lesson) -> Tensor | None:
+        """(B, style_dim) styles of a lesson's frames, detached where they are not taught."""
+        if not self.has_styles:
+            return None
+        style = self.styles(lesson.episode)
+        return torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
+
+    def _held_out_lesson(self, batch: dict[str, Any]) -> Lesson:
         lesson = Lesson.of(batch)
         if self.balance is not None:
             lesson = self.balance(lesson)
-        style = self.held_out.styles(self.predict, lesson.episode) if self.has_styles else None
-        return self.backbone.loss(self._as_outputs(batch), style, lesson.weight)
+        return replace(lesson, batch=self._as_outputs(batch))
+
+    def _held_out_styles(self, batch: dict[str, Any]) -> Tensor | None:
+        return self.held_out.styles(self.encode, batch["episode_index"]) if self.has_styles else None
+
+    def encode(
+        self,
+        episodes: Sequence[Frames],
+        starts: Tensor,
+        steps: int = ENCODING_STEPS,
+        on_step: Callable[[], object] = lambda: None,
+    ) -> tuple[Tensor, Tensor]:
+        """Styles of demonstrations that were not trained on, and their errors, see `encode_styles_by`.
+
+        Of a backbone that learns the present action the error is that of the action, else its loss.
+        """
+        traits = self.config.traits
+        imitation: Imitation = ActionErrors(self.predict)
+        if not traits.is_momentary:
+            imitation = LossErrors(self.backbone, bool(self.config.image_features))
+        return encode_styles_by(imitation, episodes, starts, steps, on_step)
+
+    def update(self) -> None:
+        """What the backbone does after each step of the optimizer; LeRobot's loop calls it."""
+        self.backbone.update()
 
     def _as_outputs(self, batch: dict[str, Any]) -> dict[str, Any]:
         """`batch` with actions as the backbone is to predict them."""
@@ -235,13 +269,26 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """(B, A) normalised actions for normalised observations (B, ...), one style per environment."""
-        return self._as_actions(self.backbone.select_action(batch, self._rollout_styles(batch)), batch)
+        style = self._rollout_styles(batch)
+        return self._as_actions(self.backbone.select_action(batch, style, **kwargs), batch)
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """(B, K, A) normalised actions, now and next."""
-        chunk = self.backbone.predict_action_chunk(batch, self._rollout_styles(batch))
-        return torch.stack([self._as_actions(outputs, batch) for outputs in chunk.unbind(1)], dim=1)
+        chunk = self.backbone.predict_action_chunk(batch, self._rollout_styles(batch), **kwargs)
+        return (
+            chunk
+            if self.relative is None
+            else torch.stack([self._as_actions(outputs, batch) for outputs in chunk.unbind(1)], dim=1)
+        )
+
+    def supports_rtc(self) -> bool:
+        """Whether the backbone does LeRobot's real-time chunking."""
+        return self.backbone.supports_rtc()
+
+    def init_rtc_processor(self) -> None:
+        """Set real-time chunking up as ``config.rtc_config`` says."""
+        self.backbone.init_rtc_processor(getattr(self.config, "rtc_config", None))
 
     def _rollout_styles(self, batch: dict[str, Any]) -> Tensor | None:
         """(B, style_dim) styles of the rollout under way."""

@@ -18,7 +18,8 @@ from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.dataset_statistics import usable_statistics
 from lerobot_swr.pauses import pause_frames
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
-from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
+from lerobot_swr.policies.demonstration_frames import DemonstrationFrames, demonstration_frames
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors, vector_pipelines
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.run_context import RunContext
 from lerobot_swr.sampling import PartnerSampler
@@ -55,7 +56,7 @@ def adopt_features(config: StateConfig, meta: LeRobotDatasetMetadata | None) -> 
                 f"{', '.join(meta.features)}; leave it out of policy.input_features, or train a new policy"
             )
     config.validate_features()
-    if images:
+    if images and not config.sees_images:
         logger.warning("Policy %r does not look at images; left out: %s", config.type, ", ".join(images))
     unusable = [] if meta is None else [key for key in inputs if key not in images and not _usable(key, meta)]
     if unusable:
@@ -64,19 +65,20 @@ def adopt_features(config: StateConfig, meta: LeRobotDatasetMetadata | None) -> 
             config.type,
             ", ".join(unusable),
         )
-    kept = {key: ft for key, ft in inputs.items() if key not in (*images, *unusable)}
+    seen = images if config.sees_images else []
+    kept = {key: ft for key, ft in inputs.items() if key not in (*images, *unusable) or key in seen}
     if meta is not None:
         check_dimensions(
             f"dataset {meta.root}",
             {key: ft["shape"] for key, ft in meta.features.items()},
-            {key: ft.shape for key, ft in kept.items()},
+            {key: ft.shape for key, ft in kept.items() if key not in images},
             "train a new policy on this dataset",
         )
     config.input_features = kept
     config.output_features = {key: ft for key, ft in outputs.items() if key == ACTION}
     for features in (config.input_features, config.output_features):
         for key, ft in features.items():
-            if key in config.dimensions:
+            if key in config.dimensions and not config.sees_images:
                 features[key] = PolicyFeature(ft.type, (config.dimensions[key],))
 
 
@@ -165,7 +167,10 @@ class TrainingData:
                 f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
                 "original dataset, or fine-tune on this one with --policy.path instead of --resume"
             )
-        pauses = _find_pauses(trajectories, config) if config.skip_pauses else None
+        # A demonstrator may wait for something that only a picture shows.
+        pauses = (
+            _find_pauses(trajectories, config) if config.skip_pauses and not config.image_features else None
+        )
         return cls(config, meta, run, trajectories, fingerprint, known is not None, is_new, pauses)
 
     @property
@@ -198,11 +203,16 @@ class TrainingData:
 
     def frames(self, episode: int, rows: np.ndarray) -> Frames:
         """Some frames of an episode, as batches bring them."""
-        return self._prepared(self.trajectories.episode(episode), rows)
+        return self._source.frames(episode, rows)
+
+    @cached_property
+    def _source(self) -> DemonstrationFrames:
+        preprocessor, _ = make_bc_pre_post_processors(self.config, self.meta.stats, self.meta)
+        return demonstration_frames(self.config, self.meta, self.trajectories, preprocessor)
 
     def _prepared(self, columns: Mapping[str, np.ndarray], rows: np.ndarray) -> Frames:
-        """Some rows of columns, as batches bring them."""
-        preprocessor, _ = make_bc_pre_post_processors(self.config, self.meta.stats)
+        """Some rows of columns of numbers, as batches bring them."""
+        preprocessor, _ = vector_pipelines(self.config, self.meta.stats)
         keys = [*self.config.observation_keys, ACTION]
         batch = preprocessor({key: torch.from_numpy(columns[key][rows]) for key in keys})
         return {key: batch[key] for key in keys}

@@ -1,13 +1,14 @@
 """Finds styles for demonstrations that were not trained on: the network is frozen, z is optimised."""
 
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import torch
 from lerobot.utils.constants import ACTION
 from torch import Tensor
 
 Frames = dict[str, Tensor]
-"""Normalised observations (T, d_k) and ``action`` (T, A) of one episode."""
+"""Normalised observations (T, ...) and ``action`` (T, ...) of one episode."""
 
 Network = Callable[[Frames, Tensor], Tensor]
 """π_θ(a | s, z): actions (B, A) of a batch of observations and of styles (B, style_dim)."""
@@ -19,6 +20,42 @@ FRAMES = 1024  # of each episode that count at all, evenly spread
 ROWS = 8192  # frames times starts that the network sees at once where no gradient is needed
 
 
+class Imitation(Protocol):
+    """How badly episodes are imitated under styles; fixed numbers, whatever is drawn at random elsewhere.
+
+    Attributes:
+        frames_per_step: Of each episode that a step looks at.
+        frames: Of each episode that count at all.
+    """
+
+    frames_per_step: int
+    frames: int
+
+    def objective(self, episodes: Sequence[Frames], styles: Tensor) -> Tensor:
+        """A scalar whose gradient into each of the (E, K, style_dim) styles is that of its own error."""
+        ...
+
+    def errors(self, episodes: Sequence[Frames], styles: Tensor) -> Tensor:
+        """(E, K) errors of episodes under their (E, K, style_dim) styles, without gradient."""
+        ...
+
+
+class ActionErrors:
+    """The mean squared error of the present action."""
+
+    def __init__(self, network: Network):
+        self.network = network
+        self.frames_per_step, self.frames = FRAMES_PER_STEP, FRAMES
+
+    def objective(self, episodes: Sequence[Frames], styles: Tensor) -> Tensor:
+        """The sum of the errors."""
+        return _errors(self.network, episodes, styles).sum()
+
+    def errors(self, episodes: Sequence[Frames], styles: Tensor) -> Tensor:
+        """See `Imitation`."""
+        return _errors_of_all(self.network, episodes, styles)
+
+
 def encode_styles(
     network: Network,
     episodes: Sequence[Frames],
@@ -26,15 +63,7 @@ def encode_styles(
     steps: int = ENCODING_STEPS,
     on_step: Callable[[], object] = lambda: None,
 ) -> tuple[Tensor, Tensor]:
-    """The style of each episode under which the network imitates it best.
-
-    Minimises the episode's mean squared error of the normalised action over z by Adam, from several starts at
-    once; the best of the ends and the starts is kept. Nothing is drawn at random and no parameter's gradient
-    changes, so this may run in the middle of training.
-
-    An episode counts with at most `FRAMES` frames, evenly spread over it. A step looks at up to
-    `FRAMES_PER_STEP` of these, evenly spread and other ones than the step before, so that time and memory do
-    not grow with the episode's length.
+    """`encode_styles_by` the mean squared error of the normalised action that a network predicts.
 
     Args:
         network: π_θ(a | s, z).
@@ -42,12 +71,40 @@ def encode_styles(
         starts: (E, K, style_dim) styles to start from.
         steps: Number of Adam steps.
         on_step: Called after each step, for a progress bar.
+    """
+    return encode_styles_by(ActionErrors(network), episodes, starts, steps, on_step)
+
+
+def encode_styles_by(
+    imitation: Imitation,
+    episodes: Sequence[Frames],
+    starts: Tensor,
+    steps: int = ENCODING_STEPS,
+    on_step: Callable[[], object] = lambda: None,
+) -> tuple[Tensor, Tensor]:
+    """The style of each episode under which it is imitated best.
+
+    Minimises the episode's error over z by Adam, from several starts at once; the best of the ends and the
+    starts is kept. Nothing is drawn at random and no parameter's gradient changes, so this may run in the
+    middle of training.
+
+    An episode counts with at most `Imitation.frames` frames, evenly spread over it. A step looks at up to
+    `Imitation.frames_per_step` of these, evenly spread and other ones than the step before, so that time and
+    memory do not grow with the episode's length.
+
+    Args:
+        imitation: The error.
+        episodes: E episodes of T_e frames.
+        starts: (E, K, style_dim) styles to start from.
+        steps: Number of Adam steps.
+        on_step: Called after each step, for a progress bar.
 
     Returns:
-        (E, style_dim) styles and (E,) their mean squared errors.
+        (E, style_dim) styles and (E,) their errors.
     """
-    thinned = [_evenly(episode, FRAMES) for episode in episodes]
-    best, best_error = starts, _errors_of_all(network, thinned, starts)
+    thinned = [_evenly(episode, imitation.frames) for episode in episodes]
+    with torch.no_grad():
+        best, best_error = starts, imitation.errors(thinned, starts)
     with torch.enable_grad():
         styles = starts.clone().requires_grad_()
         # Steps of a tenth of the styles' spread: far enough to reach any style, small enough to settle.
@@ -55,14 +112,15 @@ def encode_styles(
         optimizer = torch.optim.Adam([styles], lr=rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, max(1, steps))
         for step in range(steps):
-            error = _errors(network, [_part(episode, step) for episode in thinned], styles)
-            (styles.grad,) = torch.autograd.grad(error.sum(), [styles])
+            parts = [_part(episode, step, imitation.frames_per_step) for episode in thinned]
+            (styles.grad,) = torch.autograd.grad(imitation.objective(parts, styles), [styles])
             optimizer.step()
             schedule.step()
             on_step()
     if steps:
         ends = styles.detach()
-        error = _errors_of_all(network, thinned, ends)
+        with torch.no_grad():
+            error = imitation.errors(thinned, ends)
         improved = error < best_error
         best = torch.where(improved[..., None], ends, best)
         best_error = torch.where(improved, error, best_error)
@@ -80,9 +138,9 @@ def _evenly(episode: Frames, count: int) -> Frames:
     return {key: value[rows.to(value.device)] for key, value in episode.items() if isinstance(value, Tensor)}
 
 
-def _part(episode: Frames, step: int) -> Frames:
+def _part(episode: Frames, step: int, count: int) -> Frames:
     """The frames of an episode that a step looks at: every n-th, each step beginning one frame later."""
-    stride = -(-len(episode[ACTION]) // FRAMES_PER_STEP)
+    stride = -(-len(episode[ACTION]) // count)
     return {
         key: value[step % stride :: stride] for key, value in episode.items() if isinstance(value, Tensor)
     }

@@ -1,20 +1,21 @@
 """Enlarges a cookbook by demonstrations that were not trained on."""
 
 import logging
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import torch
-from lerobot.utils.constants import ACTION, OBS_STATE
+from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, encode_styles
+from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames
 from lerobot_swr.styles.filters import names_in
 from lerobot_swr.styles.table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
 from lerobot_swr.trajectories import Trajectories
@@ -35,8 +36,10 @@ class StyledNetwork(Protocol):
     config: Any
     styles: StyleCookbook
 
-    def predict(self, batch: dict[str, Any], style: Tensor) -> Tensor:
-        """π_θ(a | s, z): (B, A) normalised actions."""
+    def encode(
+        self, episodes: Sequence[Frames], starts: Tensor, steps: int, on_step: Callable[[], object] = ...
+    ) -> tuple[Tensor, Tensor]:
+        """Styles of episodes and their errors, see `encoding.encode_styles_by`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class EncodedStyles:
     Attributes:
         episodes: Numbers of the new styles in the cookbook.
         nearest: For each the trained episode nearest by ν.
-        errors: Mean squared error of the normalised action under the new style.
+        errors: Error under the new style: of the action, or the backbone's loss.
         errors_of_nearest: The same under the style of the nearest trained episode.
     """
 
@@ -58,7 +61,7 @@ class EncodedStyles:
 
 def add_demonstrations(
     policy: StyledNetwork,
-    preprocessor: Any,
+    read: Callable[[int], Frames],
     training: Trajectories,
     new: Trajectories,
     chosen: list[int] | None = None,
@@ -71,7 +74,7 @@ def add_demonstrations(
 
     Args:
         policy: The policy, changed in place.
-        preprocessor: The policy's inputs of raw observations and actions.
+        read: The policy's inputs of an episode of `new`.
         training: The dataset that the policy was trained on.
         new: The dataset with the new demonstrations, which has the features of the training dataset.
         chosen: Episodes of `new`; None takes all that have no style yet.
@@ -100,30 +103,34 @@ def add_demonstrations(
     rows = np.arange(len(training), len(both))  # the added ones
     ranked, _ = similarity.nearest(rows, STARTS, candidates)
     starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
-    keys = [*config.observation_keys, ACTION]
-    raw = ({key: torch.from_numpy(episode[key]) for key in keys} for episode in added.episodes())
-    frames = [{key: value for key, value in preprocessor(e).items() if key in keys} for e in raw]
-    began = torch.stack([torch.cat([f[key][0] for key in config.observation_keys]) for f in frames])
-    encoded, errors, nearest_errors = [], [], []
-    parts = [slice(i, i + CHUNK) for i in range(0, len(frames), CHUNK)]
+    encoded, errors, nearest_errors, began = [], [], [], []
+    parts = [slice(i, i + CHUNK) for i in range(0, len(chosen), CHUNK)]
     with tqdm(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
         for part in parts:
-            found = encode_styles(policy.predict, frames[part], starts[part], ENCODING_STEPS, bar.update)
+            frames = [read(episode) for episode in chosen[part]]
+            found = policy.encode(frames, starts[part], ENCODING_STEPS, bar.update)
+            began += [_first_observation(f, config.observation_keys) for f in frames]
             encoded.append(found[0])
             errors.append(found[1])
-            nearest_errors.append(encode_styles(policy.predict, frames[part], starts[part, :1], steps=0)[1])
+            nearest_errors.append(policy.encode(frames, starts[part, :1], 0)[1])
 
     first = len(styles)
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))
     if not same:
         _append_rows(policy, described, similarity, len(added))
-        styles.scenes.append(began)
+        styles.scenes.append(torch.stack(began))
     with torch.no_grad():
         styles.embedding.weight[numbers] = torch.cat(encoded)
     styles.trained[numbers] = 1
     return EncodedStyles(
         numbers, ranked[:, 0].tolist(), torch.cat(errors).tolist(), torch.cat(nearest_errors).tolist()
     )
+
+
+def _first_observation(episode: Frames, keys: Sequence[str]) -> Tensor:
+    """(d,) numbers that a policy sees at an episode's first frame; of a window, the present ones."""
+    first = [episode[key][0] for key in keys]
+    return torch.cat([value if value.ndim == 1 else value[-1] for value in first])
 
 
 def _described(policy: StyledNetwork, added: Trajectories, robot_type: str | None) -> StyleTable | None:

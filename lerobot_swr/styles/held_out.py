@@ -1,6 +1,6 @@
 """Styles of episodes that a policy in training does not train on, for the held-out loss."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -9,13 +9,16 @@ from torch import Tensor
 
 from lerobot_swr.similarity import Similarity
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.encoding import Frames, Network, encode_styles
+from lerobot_swr.styles.encoding import Frames
 from lerobot_swr.trajectories import Trajectories
 
 # Encoding happens in the middle of training, so it spends less than `lerobot-swr-styles --add`.
 ENCODING_STEPS = 100
 FRAMES = 64  # per episode, evenly spread over it
 CHUNK = 32  # episodes encoded at once
+
+Encoder = Callable[[Sequence[Frames], Tensor, int], tuple[Tensor, Tensor]]
+"""Styles and errors of episodes from their starts in some steps, see `encoding.encode_styles_by`."""
 
 
 class Demonstrations(Protocol):
@@ -53,11 +56,11 @@ class HeldOutStyles:
         """Drop what was encoded: the policy changes."""
         self._encoded = {}
 
-    def styles(self, network: Network, episodes: Tensor) -> Tensor:
+    def styles(self, encoder: Encoder, episodes: Tensor) -> Tensor:
         """(B, style_dim) styles of the (B,) `episodes`, encoded where they were not trained.
 
         Args:
-            network: π_θ(a | s, z) as it is now.
+            encoder: Finds styles for the policy as it is now.
             episodes: (B,) int64.
 
         Raises:
@@ -67,13 +70,13 @@ class HeldOutStyles:
         styles = self._cookbook.embedding(episodes).clone()
         missing = [i for i in episodes[~trained[episodes]].unique().tolist() if i not in self._encoded]
         if missing:
-            self._encode(network, missing)
+            self._encode(encoder, missing)
         for place, episode in enumerate(episodes.tolist()):
             if episode in self._encoded:
                 styles[place] = self._encoded[episode]
         return styles
 
-    def _encode(self, network: Network, missing: Sequence[int]) -> None:
+    def _encode(self, encoder: Encoder, missing: Sequence[int]) -> None:
         if self._data is None:
             raise RuntimeError("this needs the training dataset: create the policy with dataset_meta")
         lengths = self._data.trajectories.lengths
@@ -86,7 +89,7 @@ class HeldOutStyles:
         nearest, _ = self._data.similarity.nearest(np.array(missing), 1, candidates.cpu().numpy())
         starts = self._cookbook.embedding(torch.from_numpy(nearest).to(candidates.device)).detach()
         frames = [self._data.frames(i, _spread(int(lengths[i]))) for i in missing]
-        encoded, _ = encode_styles(network, frames, starts, ENCODING_STEPS)
+        encoded, _ = encoder(frames, starts, ENCODING_STEPS)
         self._encoded.update(zip(missing, encoded, strict=True))
 
 

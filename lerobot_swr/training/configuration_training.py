@@ -69,7 +69,7 @@ class SeedsTrainConfig(TrainPipelineConfig):
     @property
     def is_stacked(self) -> bool:
         """Whether the seeds are trained as one; other policies go through LeRobot's loop one by one."""
-        return self.stack and isinstance(self.policy, BCConfig) and self.policy.backbone.is_stackable
+        return self.stack and isinstance(self.policy, BCConfig) and self.policy.traits.is_stackable
 
     def _refuse_what_one_run_alone_can_do(self) -> None:
         if self.policy is None:

@@ -12,7 +12,14 @@ class Backbone(nn.Module, ABC):
 
     Where styles come from, whose style a frame teaches and how much the frame counts is decided before: a
     backbone uses the styles and weights that it is given. It passes the loss's gradient on to the styles.
+
+    Attributes:
+        numbers: What it logs of the last loss beside it.
     """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.numbers: dict[str, float] = {}
 
     @abstractmethod
     def loss(
@@ -29,23 +36,42 @@ class Backbone(nn.Module, ABC):
             The mean weighted loss, and each frame's weighted loss (B,), None if they are not known singly.
         """
 
+    def frame_losses(self, batch: dict[str, Tensor], style: Tensor | None, weight: Tensor) -> Tensor | None:
+        """(B,) each frame's weighted loss, at whatever cost; None if they cannot be known."""
+        return self.loss(batch, style, weight)[1]
+
     @abstractmethod
     def predict_action_chunk(self, batch: dict[str, Tensor], style: Tensor | None) -> Tensor:
         """(B, K, A) normalised actions, now and next, for normalised observations (B, ...).
 
-        Styles of demonstrations that were not trained on are found by this function's gradient.
+        A backbone whose policy has further options of acting (noise, the rest of the last chunk) takes them
+        as keywords.
         """
 
     def select_action(self, batch: dict[str, Tensor], style: Tensor | None) -> Tensor:
-        """(B, A) normalised actions to take now; a backbone that executes chunks overrides it."""
+        """(B, A) normalised actions to take now; a backbone that executes chunks overrides it.
+
+        The style is that of the rollout under way. Where another one comes in the middle of a chunk, it takes
+        effect at the next.
+        """
         return self.predict_action_chunk(batch, style)[:, 0]
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Parameters for the optimizer, with options of their own where they need some."""
+    def param_groups(self) -> list[dict[str, Any]] | dict[str, nn.Parameter]:
+        """Parameters for the optimizer: groups with options of their own where they need some, or by name."""
         return [{"params": list(self.parameters())}]
 
     def reset(self) -> None:
         """Start a rollout: forget what was planned."""
+
+    def update(self) -> None:
+        """What is to be done after each step of the optimizer."""
+
+    def supports_rtc(self) -> bool:
+        """Whether `predict_action_chunk` takes the options of LeRobot's real-time chunking."""
+        return False
+
+    def init_rtc_processor(self, options: Any) -> None:
+        """Set real-time chunking up, where it is supported, with LeRobot's options of it."""
 
 
 def weighted_mean(losses: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,11 +1,17 @@
-"""The backbones to choose from: ``--policy.backbone.type=…``, with the options of each beside it."""
+"""The backbones to choose from: ``--policy.backbone.type=…``, with the options of each beside it.
+
+They are this package's own, which register themselves here, and every policy that LeRobot knows: its own,
+those of plugins and this package's baselines. What a style policy asks of either is in `traits`.
+"""
 
 from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import draccus
+import lerobot.policies  # noqa: F401  (registers LeRobot's policies)
+from lerobot.configs import PreTrainedConfig
 
 from lerobot_swr.policies.backbones.backbone import Backbone
 
@@ -14,11 +20,45 @@ DEFAULT = "mlp"
 
 @dataclass
 class BackboneConfig(draccus.ChoiceRegistry):
-    """Options of a backbone; a subclass registers itself with `register_subclass`."""
+    """Options of a backbone; one of this package's own registers itself with `register_subclass`.
+
+    Policies are looked up when they are asked for, so those that a plugin registers later count, too.
+    """
 
     # Whether many policies can be trained as one: the loss draws nothing at random, sees the observations of
     # `make` alone, and `torch.vmap` takes it.
     is_stackable: ClassVar[bool] = False
+
+    @classmethod
+    def get_known_choices(cls) -> dict[str, Any]:
+        """Names and classes of all backbones' configurations."""
+        policies = {
+            name: policy
+            for name, policy in PreTrainedConfig.get_known_choices().items()
+            if not getattr(policy, "has_backbone", False)
+        }
+        return {**policies, **cls._choice_registry}
+
+    @classmethod
+    def get_choice_class(cls, name: str) -> Any:
+        """The configuration's class.
+
+        Raises:
+            KeyError: If there is none.
+        """
+        return cls.get_known_choices()[name]
+
+    @classmethod
+    def get_choice_name(cls, subcls: type) -> str:
+        """The name of a configuration's class.
+
+        Raises:
+            ValueError: If it is none of a backbone.
+        """
+        for name, known in cls.get_known_choices().items():
+            if known is subcls:
+                return name
+        raise ValueError(f"Cannot find choice name for {subcls}")
 
     @classmethod
     def default_choice_name(cls) -> str:
