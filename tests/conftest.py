@@ -30,6 +30,8 @@ pytest_plugins = [
     "corrective_policies",
     "odd_datasets",
     "reproduction_cells",
+    "styled_policies",
+    "tiny_smolvla",
     "training_command",
 ]  # more fixtures
 

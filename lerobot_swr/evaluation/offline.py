@@ -1,5 +1,6 @@
 """Offline evaluation: action errors on a dataset's frames, where there is no simulator."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torch import Tensor
 
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
+from lerobot_swr.policies.demonstration_frames import dataset_frames
 from lerobot_swr.policies.style_policy import StylePolicy
 from lerobot_swr.similarity import similarity_of
 from lerobot_swr.trajectories import Trajectories
 
 BATCH = 4096
+WINDOWS = 64  # frames at once of policies that see pictures and windows of steps
 KINDS = {
     "own": "own style",
     "nearest": "style of the nearest other demonstration",
@@ -125,20 +128,41 @@ def _squared_errors(
 ) -> np.ndarray:
     policy = checkpoint.policy
     assert isinstance(policy, StylePolicy)
+    read, size, present = _reader(checkpoint, trajectories)
     parts = []
-    for start in range(0, len(frames), BATCH):
-        rows = frames[start : start + BATCH]
-        raw: dict[str, Tensor] = {
-            key: torch.from_numpy(trajectories.columns[key][rows])
-            for key in [*policy.config.observation_keys, ACTION]
-        }
-        batch = checkpoint.preprocessor(raw)
+    for start in range(0, len(frames), size):
+        batch = read(frames[start : start + size])
         style = None
         if styles is not None:
-            used = torch.from_numpy(styles[start : start + BATCH]).to(batch[OBS_STATE].device)
+            used = torch.from_numpy(styles[start : start + size]).to(batch[OBS_STATE].device)
             style = policy.styles.embedding(used)
-        parts.append((policy.predict(batch, style) - batch[ACTION]).square().cpu().numpy())
+        with torch.random.fork_rng(devices=[]):  # a policy that draws noise draws the same for every style
+            torch.manual_seed(start)
+            predicted = policy.predict(batch, style)
+        parts.append((predicted - present(batch[ACTION])).square().cpu().numpy())
     return np.concatenate(parts)
+
+
+def _reader(
+    checkpoint: Checkpoint, trajectories: Trajectories
+) -> tuple[Callable[[np.ndarray], dict[str, Tensor]], int, Callable[[Tensor], Tensor]]:
+    """How to read frames by their rows, how many at once, and which of their actions is the present one."""
+    config = checkpoint.policy.config
+    if not config.traits.is_momentary:
+        root, numbers = Path(trajectories.name), trajectories.index
+        items = dataset_frames(config, root, checkpoint.preprocessor)
+        steps = config.action_delta_indices
+
+        def read_items(rows: np.ndarray) -> dict[str, Tensor]:
+            return items.batch((rows if numbers is None else numbers[rows]).tolist())
+
+        return read_items, WINDOWS, lambda actions: actions if steps is None else actions[:, steps.index(0)]
+
+    def read_columns(rows: np.ndarray) -> dict[str, Tensor]:
+        keys = [*config.observation_keys, ACTION]
+        return checkpoint.preprocessor({k: torch.from_numpy(trajectories.columns[k][rows]) for k in keys})
+
+    return read_columns, BATCH, lambda actions: actions
 
 
 def summarize(errors: FrameErrors) -> OfflineResult:
