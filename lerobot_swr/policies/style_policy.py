@@ -72,12 +72,11 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             self.data = data = TrainingData.read(config, dataset_meta)
             self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
         style_dim = config.style_dim if isinstance(config, ZBCConfig) else 0
-        self.backbone = config.traits.make(config, style_dim, kwargs.get("dataset_stats"), dataset_meta)
+        stats = kwargs.get("dataset_stats") if dataset_meta is None else dataset_meta.stats
+        self.backbone = config.traits.make(config, style_dim, stats, dataset_meta)
         if self.data is not None:
-            config.num_episodes, config.dataset_fingerprint = (
-                len(self.data.trajectories),
-                self.data.fingerprint,
-            )
+            config.num_episodes = len(self.data.trajectories)
+            config.dataset_fingerprint = self.data.fingerprint
         self.has_styles = isinstance(config, ZBCConfig)
         self.relative: RelativeActions | None = None
         self.correct: Correct | None = None
