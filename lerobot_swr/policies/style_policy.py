@@ -2,35 +2,29 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Self, cast
 
 import torch
-from lerobot.configs.train import TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
 from lerobot_swr.corrective.relative_actions import RelativeActions
-from lerobot_swr.policies import style_checkpoints
-from lerobot_swr.policies.checked_loading import CheckedLoading
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.dynamics import adopt_dynamics, make_relative_actions
 from lerobot_swr.policies.lessons import Balance, Correct, Lesson, LessonStep, Relabel, logged
 from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
+from lerobot_swr.policies.stored_styles import StoredStyles
 from lerobot_swr.policies.training_data import TrainingData, adopt_features, make_sampler, make_table
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.encoding import ENCODING_STEPS, ActionErrors, Frames, Imitation, encode_styles_by
 from lerobot_swr.styles.held_out import HeldOutStyles
-from lerobot_swr.styles.table import load_style_table
 from lerobot_swr.trajectories import Trajectories
 
-HUB_OPTIONS = ("revision", "token", "cache_dir", "local_files_only", "force_download")
 
-
-class StylePolicy(CheckedLoading, PreTrainedPolicy):
+class StylePolicy(StoredStyles, PreTrainedPolicy):
     """π_θ(a | s, z), with one trainable style z_i per demonstration τ_i.
 
     ``zbc`` fits each demonstration with its own style (eq. 1); in ``wzbc`` similar demonstrations teach each
@@ -301,50 +295,7 @@ class StylePolicy(CheckedLoading, PreTrainedPolicy):
             )
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
-        scene = torch.cat([batch[key].reshape(n_envs, -1) for key in self.config.observation_keys], dim=1)
+        dimensions = self.config.dimensions  # of a window of observations the last one counts
+        seen = [batch[key].reshape(n_envs, -1)[:, -dimensions[key] :] for key in self.config.observation_keys]
+        scene = torch.cat(seen, dim=1)
         return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks, scene)
-
-    # --- Checkpoints ---
-
-    @classmethod
-    def from_pretrained(cls, pretrained_name_or_path: str | Path, **kwargs: Any) -> Self:  # type: ignore[override]
-        """Load a checkpoint and its table of demonstrations; selections of styles are checked at once.
-
-        Raises:
-            ValueError: If the checkpoint is damaged, or the selection of styles is empty.
-        """
-        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
-        if policy.has_styles:
-            options = {key: kwargs[key] for key in HUB_OPTIONS if key in kwargs}
-            style_checkpoints.adopt_table(
-                policy.styles, load_style_table(pretrained_name_or_path, **options), policy.data
-            )
-            if policy.data is None:  # in training, styles to draw need not exist yet
-                style_checkpoints.select_styles(policy.styles, cast(ZBCConfig, policy.config))
-        return policy
-
-    def push_model_to_hub(self, cfg: TrainPipelineConfig, *args: Any, **kwargs: Any) -> None:
-        """As LeRobot does, and the table, whose kind of file LeRobot leaves out."""
-        if self.has_styles and self.styles.table is not None:
-            self.styles.table.upload(cast(str, self.config.repo_id), self.config.private)
-        # Last, because a remote run ends when it says that the model is there.
-        super().push_model_to_hub(cfg, *args, **kwargs)
-
-    def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        super()._save_pretrained(save_directory, state_dict)
-        if self.has_styles and self.styles.table is not None:
-            self.styles.table.save(Path(save_directory))
-
-    def adapted(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
-        """What of a checkpoint's tensors is to be loaded: on another dataset, new styles are started.
-
-        Raises:
-            ValueError: If corrective labels are asked of a checkpoint that was trained without, to act.
-        """
-        if self.correct is not None and self.data is None:
-            style_checkpoints.check_corrective(cast(ZBCConfig, self.config).corrective, state)
-        state = style_checkpoints.with_own_draws(self, state, self.data)
-        if self.data is not None and self.relative is not None:  # computed from the dataset
-            own = self.relative.state_dict().items()
-            state = {**state, **{f"relative.{key}": value for key, value in own}}
-        return style_checkpoints.with_own_styles(self.styles, state, self.data) if self.has_styles else state

@@ -66,6 +66,10 @@ class Backbone(nn.Module, ABC):
     def update(self) -> None:
         """What is to be done after each step of the optimizer."""
 
+    def peft_targets(self) -> dict[str, Any] | None:
+        """Which modules adapters (PEFT) are put on by default, by their names in the style policy."""
+        return None
+
     def supports_rtc(self) -> bool:
         """Whether `predict_action_chunk` takes the options of LeRobot's real-time chunking."""
         return False

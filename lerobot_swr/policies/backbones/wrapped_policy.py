@@ -116,6 +116,16 @@ class WrappedPolicy(Backbone):
         if callable(getattr(self.policy, "update", None)):
             self.policy.update()
 
+    def peft_targets(self) -> dict[str, Any] | None:
+        """The policy's; a pattern of its modules' names is one of names within this."""
+        targets = self.policy._get_default_peft_targets()
+        if targets is None:
+            return None
+        pattern = targets.get("target_modules")
+        if isinstance(pattern, str):
+            targets = {**targets, "target_modules": rf"backbone\.policy\.(?:{pattern})"}
+        return targets
+
     # --- Acting ---
 
     def predict_action_chunk(self, batch: dict[str, Tensor], style: Tensor | None, **options: Any) -> Tensor:
