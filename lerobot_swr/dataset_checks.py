@@ -80,7 +80,8 @@ def missing_feature(policy_type: str, key: str, meta: LeRobotDatasetMetadata) ->
     if not others:
         return (
             f"policy {policy_type!r} learns from numbers and needs the feature {key!r}; {has}: pictures "
-            "alone do not do; record the robot's state, too, or use another policy (--policy.type=act)"
+            "alone do not do; demonstrations are compared by numbers, whatever the backbone sees; record the "
+            "robot's state, too, or use another policy (--policy.type=act)"
         )
     return (
         f"policy {policy_type!r} needs the feature {key!r}; {has}; if the robot's state is "

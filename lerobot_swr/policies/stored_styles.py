@@ -99,5 +99,5 @@ class StoredStyles(CheckedLoading):
         if self.data is not None and self.data.is_new:
             raise ValueError(
                 f"peft: the adapters' checkpoint would keep the styles of {self.config.pretrained_path}, "
-                f"which are not those of dataset.root={str(self.data.root)!r}; fine-tune without adapters first"
+                f"which are not those of dataset.root={str(self.data.root)!r}; fine-tune without adapters"
             )
