@@ -289,3 +289,31 @@ def test_styles_can_be_asked_for_as_vectors(make_styled, small_maze):
     with policy.styles.requested(StyleRequest(vectors=torch.randn(1, 10))):
         policy.reset()
         assert policy.select_action(observed(policy, small_maze, size=2)).shape == (2, 2)
+
+
+def test_adapters_leave_the_network_and_train_the_styles_whole(make_styled, small_maze, tmp_path):
+    """PEFT on the modules that are named; of a checkpoint, since LeRobot loads adapters on one."""
+    pytest.importorskip("peft", reason="adapters need peft: pip install 'lerobot_policy_swr[vla]'")
+    policy = make_styled("zbc", "act", small_maze)
+    with pytest.raises(ValueError, match=r"policy\.pretrained_path"):
+        policy.wrap_with_peft(peft_cli_overrides={"target_modules": ["linear1"], "r": 2})
+    policy.config.pretrained_path = tmp_path
+    whole = {"target_modules": ["linear1"], "r": 2, "full_training_modules": ["action_head"]}
+    adapted = policy.wrap_with_peft(peft_cli_overrides=whole)
+    batch = batch_of(policy, small_maze)
+    adapted.forward(batch)[0].backward()
+    moved = [name for name, p in adapted.named_parameters() if p.grad is not None and p.grad.any()]
+    for part in ("lora", "styles.embedding.modules_to_save", "action_head.modules_to_save"):
+        assert any(part in name for name in moved), part
+    assert all("lora" in name or "modules_to_save" in name for name in moved)
+
+
+def test_smolvla_names_its_modules_for_adapters(make_styled, camera_arcs):
+    """Its pattern is one of names within the style policy."""
+    import re
+
+    policy = make_styled("zbc", "smolvla", camera_arcs)
+    pattern = policy._get_default_peft_targets()["target_modules"]
+    names = [name for name, _ in policy.named_modules() if re.fullmatch(pattern, name)]
+    assert any(name.endswith("q_proj") for name in names)
+    assert "backbone.policy.model.state_proj" in names

@@ -65,8 +65,8 @@ class StylePlace:
             queues: What LeRobot's policies keep as ``_queues``: observation to its last values; or None.
             style: (B, style_dim).
         """
-        history = queues.get(self.key) if isinstance(queues, Mapping) else None
-        for place, seen in enumerate(history or ()):
+        history = queues.get(self.key, []) if isinstance(queues, Mapping) else []
+        for place, seen in enumerate(history):
             history[place] = torch.cat([seen[..., : -self.style_dim], style.to(seen.dtype)], dim=-1)
 
     def misfit(self, plain: PreTrainedConfig) -> str | None:
