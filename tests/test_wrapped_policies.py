@@ -252,7 +252,7 @@ def test_random_numbers_are_those_of_the_step(make_styled, small_maze):
         batch = batch_of(policy, small_maze)
         torch.rand(disturbance)
         state = torch.get_rng_state()
-        losses.append([float(policy.forward(batch)[0]) for _ in range(3)])
+        losses.append([policy.forward(batch)[0].item() for _ in range(3)])
         assert torch.equal(torch.get_rng_state(), state)
     assert losses[0] == losses[1]
     assert len(set(losses[0])) == 3

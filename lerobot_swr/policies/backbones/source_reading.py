@@ -7,7 +7,7 @@ from lerobot.configs import PreTrainedConfig
 
 # How LeRobot's policies call the observations of numbers.
 NUMBERS = ("OBS_STATE", "observation.state", "robot_state", "OBS_ENV_STATE", "observation.environment_state")
-INPUTS = (*NUMBERS, "env_state", "input_features")
+INPUTS = (*NUMBERS, "env_state")
 
 
 def turns_state_into_text(config: PreTrainedConfig) -> bool:
