@@ -23,6 +23,8 @@ DATASET_RULES = {
     "maze2d_small": "lerobot_swr.envs.maze2d.behavior:small",
     "maze2d_medium": "lerobot_swr.envs.maze2d.behavior:medium",
     "maze2d_large": "lerobot_swr.envs.maze2d.behavior:large",
+    "maze2d_scenes": "lerobot_swr.envs.maze2d.behavior:scenes",
+    "maze2d_scenes_large": "lerobot_swr.envs.maze2d.behavior:scenes_large",
     "d3il_avoiding": "lerobot_swr.envs.d3il.behavior:avoiding_behavior",
     "d3il_aligning": "lerobot_swr.envs.d3il.behavior:aligning_behavior",
 }

@@ -65,7 +65,7 @@ def maze_recipe():
 def replayed(recorded, env_cfg, features, env=None):
     """The result of replaying episodes."""
     env = env or env_cfg.create_rollout_env(len(recorded))
-    replays = play(env, recorded, env_cfg.start_rule(), seed=0)
+    replays = play(env, recorded, list(map(env_cfg.start_rule(), recorded)), seed=0)
     env.close()
     rule, names = env_cfg.behavior_rule(), {key: features[key] for key in (STATE, SCENE)}
     return evaluate_replays(range(len(recorded)), recorded, replays, names, rule, env.single_action_space)
@@ -157,7 +157,7 @@ def test_without_a_rule_behaviors_are_left_out(maze_recipe):
     """Success and deviation need no behaviour rule."""
     cfg, recorded = Maze2DEnvConfig(task="small"), [as_episode(next(maze_recipe.demonstrations(0)))]
     env = cfg.create_rollout_env(1)
-    replays = play(env, recorded, cfg.start_rule(), seed=0)
+    replays = play(env, recorded, list(map(cfg.start_rule(), recorded)), seed=0)
     result = evaluate_replays([0], recorded, replays, {STATE: ["x", "y"]}, None, env.single_action_space)
     assert result.behavior_match is None
     assert result.episodes[0]["recorded"] is None

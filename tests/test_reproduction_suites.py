@@ -86,6 +86,19 @@ def test_aligning_is_measured_in_new_scenes_and_in_one(settings, demos):
             assert [c.definition.get("one_scene", False) for c in of_it] == [False, True][: len(expected)]
 
 
+def test_scenes_are_told_apart_in_a_suite_of_their_own(settings, demos):
+    """Every policy in own scenes and in new ones, wzbc also with beta 2; a dataset of one scene is refused."""
+    mazes = dataclasses.replace(demos, env={"type": "maze2d", "task": "scenes"})
+    cells = [c for c in suite_cells("scenes", settings, [mazes]) if c.kind == "evaluate"]
+    named = [c.labels.policy.replace(" hidden_dim=16", "") for c in cells]
+    baselines = [name for name in ("bc", "act", "diffusion", "beso") if name in known_policies()]
+    assert list(dict.fromkeys(named)) == [*baselines, "zbc", "wzbc", "wzbc beta=2"]
+    assert [c.definition["scenes"] for c in cells] == ["own", "new"] * (len(cells) // 2)
+    assert set(suite_datasets("scenes", settings)) == {"scenes_maze-two_ways", "scenes_large_maze-six_ways"}
+    with pytest.raises(ValueError, match="every episode of its environment has the same scene"):
+        suite_cells("scenes", settings, [demos])
+
+
 def test_human_recordings_join_where_their_folder_is_given(tmp_path):
     """First in table1, robustness and contracting; without the folder no suite has them."""
     without, given = (ReproductionSettings(from_d3il=folder) for folder in (None, tmp_path))

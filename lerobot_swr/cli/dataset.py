@@ -2,6 +2,7 @@
 
 Examples:
     lerobot-swr-dataset --task=medium_maze-only_forward --root=data/only_forward --seed=0
+    lerobot-swr-dataset --task=scenes_maze-two_ways --n_episodes=500 --root=data/two_ways
     lerobot-swr-dataset --task=avoiding --from_d3il=recordings/avoiding --root=data/recorded_avoiding
 """
 
@@ -30,12 +31,14 @@ class DatasetCommand:
     """Options of ``lerobot-swr-dataset``."""
 
     # Which dataset: medium_maze-one_side, medium_maze-only_forward, medium_maze-only_fast or
-    # medium_maze-spread_out;
+    # medium_maze-spread_out; scenes_maze-two_ways, scenes_maze-two_ways_500 or scenes_large_maze-six_ways;
     # d3il_avoiding, d3il_unbalanced_avoiding, d3il_aligning or d3il_unbalanced_aligning.
     # With from_d3il: avoiding, unbalanced_avoiding (a seeded selection of avoiding's recordings) or aligning.
     task: str
     # Folder of the new dataset.
     root: Path
+    # Number of demonstrations, of the scenes_* datasets; null takes the dataset's usual one.
+    n_episodes: int | None = None
     # Seed of the demonstrations.
     seed: int = 0
     # Name of the dataset for LeRobot; default: local/<task>.
@@ -56,6 +59,8 @@ def write(cfg: DatasetCommand) -> None:
         recipe = recorded_recipe(cfg.from_d3il, cfg.task, cfg.file_list)
     else:
         recipe = get_recipe(cfg.task)
+    if cfg.n_episodes is not None:
+        recipe = recipe.with_episodes(cfg.n_episodes)
     histogram = write_dataset(recipe, cfg.root, cfg.seed, cfg.repo_id, cfg.overwrite)
     total = sum(histogram.values())
     print(f"{total} episodes of {recipe.name} in {cfg.root}")

@@ -102,6 +102,7 @@ def evaluate(cfg: EvalCommand) -> None:
         seed=cfg.seed,
         reference_episodes=cfg.dataset.episodes,
         recorded_starts=cfg.recorded_starts,
+        scenes=cfg.scenes,  # type: ignore[arg-type]
     )
     result = comparison.result
     write_json(cfg.output_dir / "behaviors.json", result, _provenance(cfg))
@@ -140,7 +141,9 @@ def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
     if cfg.env is not None:
         check_environment(cfg.env, checkpoint.shapes, cfg.rename_map, "the checkpoint")
-    return checkpoint, load_reference(cfg.dataset, checkpoint, needs_actions=cfg.env is None)
+    return checkpoint, load_reference(
+        cfg.dataset, checkpoint, needs_actions=cfg.env is None or cfg.scenes is not None
+    )
 
 
 def _replay(cfg: EvalCommand) -> None:

@@ -15,6 +15,7 @@ CONFLICTS = {
     "blend": ("length_band", "n_episodes", "style_sampling", "policy.style_sampling", "dataset.episodes"),
     "length_band": ("dataset.episodes",),
     "recorded_starts": ("robustness", "counterfactual", "blend"),
+    "scenes": ("recorded_starts", "robustness", "counterfactual", "blend", "policy.style_interpolate"),
     "style_sampling": ("policy.style_sampling",),
     "baseline": ("rename_map", "policy.*"),
     "baseline=replay": (
@@ -25,11 +26,12 @@ CONFLICTS = {
         "n_episodes",
         "style_sampling",
         "recorded_starts",
+        "scenes",
     ),
 }
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),
-    *("style_sampling", "behavior_rule", "n_episodes", "batch_size", "recorded_starts"),
+    *("style_sampling", "behavior_rule", "n_episodes", "batch_size", "recorded_starts", "scenes"),
     *("policy.style_sampling", "policy.style_interpolate"),
 )
 

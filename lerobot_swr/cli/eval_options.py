@@ -11,6 +11,7 @@ from lerobot_swr.cli.eval_conflicts import refuse_conflicts
 from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import DatasetSource
+from lerobot_swr.evaluation.scenes import check_scenes
 from lerobot_swr.styles.drawing import check_style_sampling
 
 
@@ -37,6 +38,10 @@ class EvalCommand:
     # Begin rollout k where the k-th demonstration (of dataset.episodes) began, not where the environment
     # draws; with style_sampling fixed it has that demonstration's style, too.
     recorded_starts: bool = False
+    # own: each rollout begins in the recorded scene of the demonstration whose style it uses; new: in a scene
+    # that nobody demonstrated. Blind replay of the demonstrations is measured beside. Of tasks whose episodes
+    # have scenes of their own.
+    scenes: str | None = None
     # Request every demonstrated behaviour from this many starts, the same for all, instead of n_episodes
     # rollouts: confusion matrix, control accuracy, distance to the requested demonstrations. 0 does not.
     counterfactual: int = 0
@@ -65,6 +70,8 @@ class EvalCommand:
         if self.style_sampling is not None:
             check_style_sampling(self.style_sampling)
         self._refuse_conflicts()
+        if self.scenes is not None and self.env is not None:
+            check_scenes(self.scenes, self.env)
         if self.recorded_starts and self.env is not None:
             task_of(self.env).start_rule()  # refuses environments that have none
         self._find_policy()
@@ -87,6 +94,7 @@ class EvalCommand:
             "blend": self.blend > 0,
             "length_band": self.length_band is not None,
             "recorded_starts": self.recorded_starts,
+            "scenes": self.scenes is not None,
             "style_sampling": self.style_sampling is not None,
             "behavior_rule": self.behavior_rule is not None,
             "n_episodes": self._is_given("n_episodes"),

@@ -16,6 +16,7 @@ from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal
 from lerobot_swr.envs.maze2d.env import FPS, INSTRUCTION, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, get_layout
+from lerobot_swr.envs.maze2d.scenes import draw_scene, draw_start, maze_of, scene_names
 
 DOOR_SPREAD = 0.75  # paths use this share of a door's width
 PATH_SPREAD = 0.05  # standard deviation of the free points between the walls
@@ -30,7 +31,11 @@ SpeedRule = Callable[[np.random.Generator, float], float]
 
 
 def forward_path(
-    checkpoints: str, layout: MazeLayout, rng: np.random.Generator, path_spread: float = PATH_SPREAD
+    checkpoints: str,
+    layout: MazeLayout,
+    rng: np.random.Generator,
+    path_spread: float = PATH_SPREAD,
+    start: np.ndarray | None = None,
 ) -> np.ndarray:
     """A smooth path from the start through one door of every wall to the goal.
 
@@ -39,11 +44,12 @@ def forward_path(
         layout: The maze.
         rng: Source of the variation.
         path_spread: Standard deviation of the free points between the walls.
+        start: (2,) where the path begins; None takes the layout's start.
 
     Returns:
         (P, 2) densely spaced points; y grows strictly, so no wall is crossed outside its door.
     """
-    points = [np.array(layout.start)]
+    points = [np.array(layout.start) if start is None else start]
     for wall, checkpoint in zip(layout.walls, checkpoints[:-1], strict=True):
         door = next(door for door in wall.doors if str(door.checkpoint) == checkpoint)
         x = door.x + DOOR_SPREAD * door.half_width * rng.uniform(-1, 1)
@@ -63,7 +69,12 @@ def forward_path(
 
 
 def walk(
-    path: np.ndarray, speed: float, task: str, rng: np.random.Generator, speed_wobble: float = SPEED_WOBBLE
+    path: np.ndarray,
+    speed: float,
+    task: str,
+    rng: np.random.Generator,
+    speed_wobble: float = SPEED_WOBBLE,
+    scene: np.ndarray | None = None,
 ) -> Demonstration:
     """Follow a path in the environment.
 
@@ -73,6 +84,7 @@ def walk(
         task: Name of the maze.
         rng: Source of the variation.
         speed_wobble: Relative standard deviation of the speed along the way.
+        scene: (S,) scene, where the maze has scenes.
 
     Returns:
         The demonstration; its last `FRAMES_AT_GOAL` frames lie in the goal disc.
@@ -81,6 +93,8 @@ def walk(
         RuntimeError: If the goal is not reached, i.e. the path cannot be followed.
     """
     agents = MazeAgents(task, "fixed", 0.0, 0.0, sticky_walls=False)
+    scenes = (np.array(agents.layout.goal) if scene is None else scene)[None]
+    maze = maze_of(agents.layout, scenes[0])
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     position, progress = path[0][None], 0.0
     wobble, tremor = 0.0, np.zeros(2)
@@ -100,9 +114,9 @@ def walk(
         step = direction * min(1.0, pace / max(distance, 1e-9))
         action = np.clip(step / MAX_STEP + TREMOR * tremor, -1, 1).astype(np.float32)
 
-        states.append(agents.observe(position))
+        states.append(agents.observe(position, scenes))
         actions.append(action)
-        frames_at_goal += bool(in_goal(position, agents.layout)[0])
+        frames_at_goal += bool(in_goal(position, maze)[0])
         if frames_at_goal == FRAMES_AT_GOAL:
             observations = {
                 "observation.state": np.concatenate([state["agent_pos"] for state in states]),
@@ -111,7 +125,7 @@ def walk(
                 ),
             }
             return Demonstration(observations, np.stack(actions))
-        position, _ = agents.step(position, action[None], [])
+        position, _ = agents.step(position, action[None], [], scenes)
     raise RuntimeError(f"the demonstrator did not reach the goal of {task!r}")
 
 
@@ -138,15 +152,16 @@ def demonstrate(
     path_spread: float = PATH_SPREAD,
     speed_wobble: float = SPEED_WOBBLE,
 ) -> Iterator[Demonstration]:
-    """One demonstration per entry of `behaviors`, in an order shuffled by the seed."""
+    """One demonstration per entry of `behaviors`, in an order shuffled by the seed, each in its own scene."""
     rng = np.random.default_rng(seed)
     layout = get_layout(task)
     rule = MazeBehaviorRule(layout)
     for behavior in rng.permutation(np.array(behaviors)):
         while True:
-            path = forward_path(behavior, layout, rng, path_spread)
+            scene, start = draw_scene(layout, rng), draw_start(layout, rng)
+            path = forward_path(behavior, maze_of(layout, scene), rng, path_spread, start)
             path_length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-            demonstration = walk(path, speed(rng, path_length), task, rng, speed_wobble)
+            demonstration = walk(path, speed(rng, path_length), task, rng, speed_wobble, scene)
             # Hand tremor near a door's edge can, rarely, miss the door: such a recording is thrown away.
             if rule(demonstration.observations) == behavior:
                 break
@@ -154,7 +169,12 @@ def demonstrate(
 
 
 def _recipe(
-    name: str, task: str, counts: dict[str, int], speed: SpeedRule, **variation: float
+    name: str,
+    task: str,
+    counts: dict[str, int],
+    speed: SpeedRule,
+    resized: Callable[[int], DatasetRecipe] | None = None,
+    **variation: float,
 ) -> DatasetRecipe:
     behaviors = [behavior for behavior, count in counts.items() for _ in range(count)]
     return DatasetRecipe(
@@ -164,13 +184,20 @@ def _recipe(
         robot_type=f"maze2d_{task}",
         features={
             "observation.state": ("x", "y"),
-            "observation.environment_state": ("goal_x", "goal_y"),
+            "observation.environment_state": scene_names(get_layout(task)),
             "action": ("dx", "dy"),
         },
         n_episodes=len(behaviors),
         demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed, **variation),
         behavior_rule=MazeBehaviorRule(get_layout(task)),
+        resized=resized,
     )
+
+
+def _scenes_recipe(name: str, task: str, ways: Sequence[str], n_episodes: int) -> DatasetRecipe:
+    """Every episode in a scene of its own, the behaviours as equally often as they can be."""
+    counts = {way: len(range(i, n_episodes, len(ways))) for i, way in enumerate(ways)}
+    return _recipe(name, task, counts, steady, lambda n: _scenes_recipe(name, task, ways, n))
 
 
 # All 12 forward behaviours of the medium maze, unbalanced.
@@ -188,6 +215,10 @@ ONLY_FORWARD = {
     "7320": 4,
     "6510": 3,
 }
+
+# Through which doors, wherever these are.
+TWO_WAYS = ("10", "20")
+SIX_WAYS = ("410", "420", "430", "510", "520", "530")
 
 MAZE_RECIPES = (
     _recipe("medium_maze-one_side", "medium", {"6410": 50, "7420": 50}, steady),
@@ -207,4 +238,7 @@ MAZE_RECIPES = (
         path_spread=2 * PATH_SPREAD,
         speed_wobble=0.02,
     ),
+    _scenes_recipe("scenes_maze-two_ways", "scenes", TWO_WAYS, 100),
+    _scenes_recipe("scenes_maze-two_ways_500", "scenes", TWO_WAYS, 500),
+    _scenes_recipe("scenes_large_maze-six_ways", "scenes_large", SIX_WAYS, 100),
 )

@@ -40,6 +40,7 @@ class DatasetRecipe:
         resumable_demonstrations: For a source that takes long, if not None: the same episodes, made on all
             cores; finished ones are kept in the folder given, and those that an interrupted run with the same
             seed left there are used.
+        resized: The same recipe for another number of episodes; None where it has one number only.
     """
 
     name: str
@@ -51,3 +52,18 @@ class DatasetRecipe:
     demonstrations: Callable[[int], Iterator[Demonstration]]
     behavior_rule: BehaviorRule
     resumable_demonstrations: Callable[[int, Path], Iterator[Demonstration]] | None = None
+    resized: "Callable[[int], DatasetRecipe] | None" = None
+
+    def with_episodes(self, n_episodes: int) -> "DatasetRecipe":
+        """The recipe for another number of episodes.
+
+        Raises:
+            ValueError: If it is not for another number, or that is none.
+        """
+        if n_episodes < 1:
+            raise ValueError(f"n_episodes={n_episodes}: expected at least 1")
+        if self.resized is None:
+            raise ValueError(
+                f"n_episodes={n_episodes}: {self.name} always has {self.n_episodes} episodes; leave it out"
+            )
+        return self.resized(n_episodes)

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,13 @@ from lerobot_swr.evaluation.metrics import (
     success_interval,
 )
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.evaluation.scenes import (
+    SceneKind,
+    SceneResult,
+    evaluate_scenes,
+    format_scenes,
+    run_in_scenes,
+)
 from lerobot_swr.trajectories import Trajectories
 from lerobot_swr.whole_files import write_whole
 
@@ -58,6 +65,7 @@ class BehaviorResult:
         histogram: Label to share of the rollouts.
         reference_histogram: Label to share of the demonstrations.
         episodes: One record per rollout.
+        scenes: Own or new scenes, with blind replay beside the policy; None where it was not asked for.
     """
 
     style_sampling: str | None
@@ -79,6 +87,7 @@ class BehaviorResult:
     histogram: Histogram
     reference_histogram: Histogram
     episodes: list[dict[str, Any]]
+    scenes: SceneResult | None = None
 
 
 def evaluate_behaviors(
@@ -185,6 +194,7 @@ def compare(
     seed: int = 1000,
     reference_episodes: Sequence[int] | None = None,
     recorded_starts: bool = False,
+    scenes: SceneKind | None = None,
 ) -> Comparison:
     """Roll a policy out and compare it with its demonstrations.
 
@@ -199,6 +209,8 @@ def compare(
         reference_episodes: The demonstrations to compare with; None takes all.
         recorded_starts: Begin where these demonstrations did, one after the other and again from the first,
             instead of where the environment draws.
+        scenes: ``own`` begins each rollout in the scene of the demonstration whose style it uses, ``new`` in
+            one that nobody demonstrated; either adds blind replay of these demonstrations.
 
     Raises:
         MissingRuleError: If the environment cannot be put into a recorded start.
@@ -210,21 +222,31 @@ def compare(
         start_of = task.start_rule()
         starts = [start_of(trajectories.episode(chosen[k % len(chosen)])) for k in range(n_episodes)]
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
-    rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed, starts=starts)
+    found = None
+    if scenes is None:
+        rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed, starts=starts)
+    else:
+        found = run_in_scenes(
+            checkpoint, trajectories, env_cfg, rule, scenes, n_episodes, batch_size, seed, reference_episodes
+        )
+        rollouts = found.rollouts
     sampling, drawn = None, None
     if checkpoint.has_styles:
         sampling = checkpoint.policy.config.style_sampling
         drawn = allowed_episodes(checkpoint, len(demonstrated))
+    result = evaluate_behaviors(
+        rollouts,
+        demonstrated,
+        sampling,
+        reference_episodes,
+        drawn,
+        steps_to_end(env_cfg, trajectories),
+        env_cfg,
+    )
+    if found is not None and scenes is not None:
+        result = replace(result, scenes=evaluate_scenes(found, scenes, demonstrated, rule, task))
     return Comparison(
-        evaluate_behaviors(
-            rollouts,
-            demonstrated,
-            sampling,
-            reference_episodes,
-            drawn,
-            steps_to_end(env_cfg, trajectories),
-            env_cfg,
-        ),
+        result,
         [(task.plot_path(trajectories.episode(i)), demonstrated[i]) for i in chosen],
         [(task.plot_path(rollout.observations), rollout.behavior) for rollout in rollouts],
     )
@@ -268,4 +290,6 @@ def format_result(result: BehaviorResult) -> str:
     for label in {**result.reference_histogram, **result.histogram}:
         shares = result.reference_histogram.get(label, 0.0), result.histogram.get(label, 0.0)
         lines.append(f"{label or '(none)':<24} {shares[0]:6.3f} {shares[1]:8.3f}")
+    if result.scenes is not None:
+        lines.append(format_scenes(result.scenes))
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""Plays recorded actions in an environment, open loop, from the recorded start."""
+"""Plays recorded actions in an environment, open loop, from the recorded start or another one."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +10,6 @@ from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 from lerobot.utils.constants import ACTION
 from tqdm import tqdm
 
-from lerobot_swr.envs.task import StartRule
 from lerobot_swr.evaluation.rollouts import StateRecorder
 
 
@@ -30,7 +29,7 @@ class Replay:
 def play(
     env: gym.vector.VectorEnv,
     recorded: Sequence[Mapping[str, np.ndarray]],
-    start_rule: StartRule,
+    starts: Sequence[Mapping[str, Any]] | None,
     seed: int,
     progress: tqdm | None = None,
 ) -> list[Replay]:
@@ -39,15 +38,15 @@ def play(
     Args:
         env: A vector environment that resets single sub-environments (Gymnasium's ``reset_mask``).
         recorded: One episode per sub-environment, with its actions.
-        start_rule: Options of `reset` for a recorded start.
+        starts: Options of `reset` for each sub-environment, see `Task.start_rule`; None lets it draw its own.
         seed: Of the first sub-environment, the others count on.
         progress: Counts the steps.
     """
     recorder, n = StateRecorder(env), env.num_envs
     seeds = list(range(seed, seed + n))
     recorder.reset(seed=seeds, options={NEW_ROLLOUT_OPTION: True})
-    for i, episode in enumerate(recorded):
-        options = {**start_rule(episode), NEW_ROLLOUT_OPTION: True, "reset_mask": np.arange(n) == i}
+    for i, start in enumerate(starts or ()):
+        options = {**start, NEW_ROLLOUT_OPTION: True, "reset_mask": np.arange(n) == i}
         recorder.reset(seed=seeds, options=options)
     actions = [episode[ACTION] for episode in recorded]
     lengths = np.array([len(own) for own in actions])

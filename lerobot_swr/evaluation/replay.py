@@ -99,7 +99,8 @@ def run_replay(
             batch = recorded[len(replays) : len(replays) + batch_size]
             env = task.create_rollout_env(len(batch))
             try:
-                replays += play(env, batch, start_rule, seed + len(replays), progress)
+                starts = [start_rule(one) for one in batch]
+                replays += play(env, batch, starts, seed + len(replays), progress)
                 space = env.single_action_space
             finally:
                 env.close()

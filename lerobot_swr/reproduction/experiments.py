@@ -11,6 +11,7 @@ from typing import Any
 import draccus
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.evaluation.scenes import SceneKind
 from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Labels
@@ -98,6 +99,7 @@ def evaluation(
     protocols: Sequence[str] = ("uniform", "stratified"),
     style_filter: str | None = None,
     one_scene: bool = False,
+    scenes: SceneKind | None = None,
 ) -> Cell:
     """An evaluation cell on a training.
 
@@ -113,17 +115,20 @@ def evaluation(
         protocols: Ways of drawing styles; policies without styles are rolled out once.
         style_filter: Only styles of demonstrations that match.
         one_scene: All rollouts of a training seed meet one scene, instead of each its own.
+        scenes: ``own``: each rollout meets the scene of its style's demonstration; ``new``: one that nobody
+            demonstrated. Either has blind replay beside it.
     """
     policy = trained.definition["policy"]
     has_styles = hasattr(PreTrainedConfig.get_choice_class(policy), "style_sampling")
     rolled_out = _rolled_out(settings, demos, env, protocols if has_styles else ("uniform",))
-    as_it_is = rolled_out["env"] == whole_environment(demos.env) and not one_scene
+    as_it_is = rolled_out["env"] == whole_environment(demos.env) and not one_scene and scenes is None
     pictured = style_filter is None and as_it_is
     definition = {
         **rolled_out,
         "style_filter": style_filter,
         "paths": pictured and trained == training(settings, demos, policy),
         **({"one_scene": True} if one_scene else {}),
+        **({"scenes": scenes} if scenes is not None else {}),
     }
     return Cell("evaluate", Labels(demos.name, trained.labels.policy, condition), definition, trained)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import Task, task_of
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
@@ -16,6 +17,7 @@ from lerobot_swr.evaluation.checkpoint import (
 )
 from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
+from lerobot_swr.evaluation.scenes import SceneRollouts, run_in_scenes, scene_matches
 from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import environment, short_path
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS
@@ -73,11 +75,20 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     count = definition["protocols"][protocol]
     env_seed = environment_seed(definition["seed"], seed)
     env_seeds = [env_seed] * count if definition.get("one_scene") else None
-    rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed, env_seeds)
+    kind = definition.get("scenes")
+    found = None
+    if kind is None:
+        rollouts = run_rollouts(checkpoint, env_cfg, rule, count, BATCH_SIZE, env_seed, env_seeds)
+    else:
+        found = run_in_scenes(checkpoint, trajectories, env_cfg, rule, kind, count, BATCH_SIZE, env_seed)
+        rollouts = found.rollouts
+    columns = _columns(rollouts, demonstrated, task)
+    if found is not None:
+        columns |= _scene_columns(found, demonstrated, rule, task)
     filtered = definition["style_filter"] is not None
     drawn = rollouts if definition["paths"] else []
     return {
-        "rollouts": _columns(rollouts, demonstrated, task),
+        "rollouts": columns,
         "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
         "paths": [short_path(task.plot_path(rollout.observations)) for rollout in drawn],
     }
@@ -122,4 +133,16 @@ def _columns(rollouts: list[Rollout], demonstrated: list[str], task: Task) -> di
         "length": [rollout.length for rollout in rollouts],
         "style": [rollout.style_episode for rollout in rollouts],
         "match": [match(rollout) for rollout in rollouts],
+    }
+
+
+def _scene_columns(
+    found: SceneRollouts, demonstrated: list[str], rule: BehaviorRule, task: Task
+) -> dict[str, list]:
+    """Matches of policies without styles, too (by chance), and of blind replay."""
+    matches, replayed = scene_matches(found, demonstrated, rule, task)
+    return {
+        "match": list(map(int, matches)),
+        "replay_success": [int(replay.success) for replay in found.replays],
+        "replay_match": list(map(int, replayed)),
     }

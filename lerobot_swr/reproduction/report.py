@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_swr.evaluation.report import Picture, Section, write_markdown, write_report
-from lerobot_swr.reproduction import contracting_tables, figures, tables
+from lerobot_swr.reproduction import contracting_tables, figures, scene_tables, tables
 from lerobot_swr.reproduction.paper import SOURCE
 from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
 from lerobot_swr.reproduction.stored_results import (
@@ -49,6 +49,7 @@ def write_results_report(root: Path) -> Path:
         "robustness": _robustness,
         "contracting": _contracting,
         "control": _control,
+        "scenes": _scenes,
         "figures": _figures,
     }
     sections = [
@@ -208,6 +209,12 @@ def _control(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             )
         if cells:
             yield Section(f"Control: {name}", [tables.control(suite, name)], drawn)
+
+
+def _scenes(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
+    for name in suite.datasets:
+        if suite.evaluations(name):
+            yield Section(f"Scenes: {name}", [scene_tables.scenes(suite, name)], [])
 
 
 def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:

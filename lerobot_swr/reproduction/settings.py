@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-SUITES = ("table1", "robustness", "contracting", "control", "figures")
+SUITES = ("table1", "robustness", "contracting", "control", "scenes", "figures")
 MAX_ROLLOUTS = 100_000  # per training seed: how far apart the environments' seeds of training seeds lie
 
 
@@ -13,7 +13,7 @@ MAX_ROLLOUTS = 100_000  # per training seed: how far apart the environments' see
 class ReproductionSettings:
     """Options of ``lerobot-swr-reproduce``."""
 
-    # table1, robustness, contracting, control, figures, or all of them.
+    # table1, robustness, contracting, control, scenes, figures, or all of them.
     suite: str = "all"
     # Training steps of bc, zbc and wzbc. The paper's.
     steps: int = 100_000

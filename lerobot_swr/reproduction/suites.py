@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from lerobot_swr.envs.task import task_of
+from lerobot_swr.evaluation.scenes import SceneKind
 from lerobot_swr.reproduction.baselines import known_policies
 from lerobot_swr.reproduction.cells import Cell, Labels
 from lerobot_swr.reproduction.demonstrations import (
@@ -34,11 +35,13 @@ CONTRACTING_DATASETS = (
 )
 CONTROL_DATASETS = ("medium_maze-only_fast",)
 FIGURES_DATASETS = ("medium_maze-only_forward",)
+SCENES_DATASETS = ("scenes_maze-two_ways", "scenes_large_maze-six_ways")
 DATASETS = {
     "table1": TABLE1_DATASETS,
     "robustness": ROBUSTNESS_DATASETS,
     "contracting": CONTRACTING_DATASETS,
     "control": CONTROL_DATASETS,
+    "scenes": SCENES_DATASETS,
     "figures": FIGURES_DATASETS,
 }
 # In the suites where the folder of the human recordings is given.
@@ -54,6 +57,7 @@ Conditions = dict[str, tuple[dict[str, Any], tuple[str, ...]]]
 
 UNPERTURBED = "deterministic"
 ONE_SCENE = "one scene"
+SCENE_CONDITIONS: dict[SceneKind, str] = {"own": "own scenes", "new": "new scenes"}
 BOTH_PROTOCOLS = ("uniform", "stratified")
 
 # --- Robustness (the paper's Table 2) ---
@@ -80,6 +84,11 @@ CORRECTIVE = (("zbc", "noise"), ("zbc", "demos"), ("wzbc", "noise"))
 # --- Control ---
 LENGTH_BAND = (70, 80)
 
+# --- Scenes: beyond the paper, docs/scenes.md ---
+SCENES_POLICIES = ("bc", "act", "diffusion", "beso", "zbc", "wzbc")
+# As published, and so that other demonstrations teach a style, too, in their scenes.
+SCENES_WZBC: tuple[dict[str, Any], ...] = ({}, {"beta": 2.0})
+
 # --- Figures ---
 REFERENCES = 3
 RHO_BETAS = (0.0, 3.0, 10.0, 100.0)
@@ -101,6 +110,7 @@ def suite_cells(suite: str, settings: ReproductionSettings, datasets: Sequence[D
         "robustness": _robustness,
         "contracting": _contracting,
         "control": _control,
+        "scenes": _scenes,
         "figures": _figures,
     }
     cells = [cell for demos in datasets for cell in build[suite](settings, demos)]
@@ -191,6 +201,18 @@ def _control(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[
                 protocols=("uniform",),
                 style_filter=f"{low} <= length and length <= {high}",
             )
+
+
+def _scenes(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
+    if not task_of(environment(demos.env)).draws_scenes:
+        raise ValueError(f"datasets: {demos.name!r}: every episode of its environment has the same scene")
+    known = [policy for policy in SCENES_POLICIES if policy in known_policies()]
+    for policy in settings.choose_policies(tuple(known)):
+        variants = SCENES_WZBC if policy == "wzbc" else ({},)
+        for options in variants:
+            trained = training(settings, demos, policy, options)
+            for kind, condition in SCENE_CONDITIONS.items():
+                yield evaluation(settings, demos, trained, condition, protocols=("stratified",), scenes=kind)
 
 
 def _figures(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:

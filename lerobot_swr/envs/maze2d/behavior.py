@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 
 import numpy as np
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_swr.envs.maze2d.dynamics import in_goal
 from lerobot_swr.envs.maze2d.layouts import LAYOUTS, MazeLayout
+from lerobot_swr.envs.maze2d.scenes import maze_of
 
 
 def checkpoints_passed(positions: np.ndarray, layout: MazeLayout) -> str:
@@ -52,11 +54,17 @@ class MazeBehaviorRule:
         self.layout = layout
 
     def __call__(self, observations: Mapping[str, np.ndarray]) -> str:
-        """Label an episode from its ``observation.state`` (T, 2)."""
-        return checkpoints_passed(observations["observation.state"], self.layout)
+        """Label an episode from its ``observation.state`` (T, 2) and its scene, if the maze has scenes."""
+        return checkpoints_passed(observations[OBS_STATE], self.maze(observations))
+
+    def maze(self, observations: Mapping[str, np.ndarray]) -> MazeLayout:
+        """The maze of an episode, by its ``observation.environment_state`` (T, S) where scenes differ."""
+        return maze_of(self.layout, observations[OBS_ENV_STATE][0]) if self.layout.scenes else self.layout
 
 
 # The rules by name, for --policy.behavior_rule=lerobot_swr.envs.maze2d.behavior:medium
 small = MazeBehaviorRule(LAYOUTS["small"])
 medium = MazeBehaviorRule(LAYOUTS["medium"])
 large = MazeBehaviorRule(LAYOUTS["large"])
+scenes = MazeBehaviorRule(LAYOUTS["scenes"])
+scenes_large = MazeBehaviorRule(LAYOUTS["scenes_large"])

@@ -1,4 +1,4 @@
-"""Maze2D as a LeRobot environment: ``--env.type=maze2d --env.task=small|medium|large``."""
+"""Maze2D as a LeRobot environment: ``--env.type=maze2d --env.task=small|medium|large|scenes``, and more."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,15 +10,15 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Rectangle
 
-from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.dynamics import in_goal
 from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
-from lerobot_swr.envs.maze2d.layouts import get_layout
+from lerobot_swr.envs.maze2d.layouts import MazeLayout, Scenes, get_layout
+from lerobot_swr.envs.maze2d.scenes import scene_names
 from lerobot_swr.envs.task import StartRule
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
@@ -77,7 +77,8 @@ class Maze2DEnvConfig(TaskEnvConfig):
         Raises:
             ValueError: Naming the offending key and value.
         """
-        MazeAgents(**self._maze_options)
+        layout = MazeAgents(**self._maze_options).layout
+        self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (len(scene_names(layout)),))
         if self.episode_length < 1:
             raise ValueError(f"episode_length={self.episode_length}: expected at least 1 step")
 
@@ -106,17 +107,27 @@ class Maze2DEnvConfig(TaskEnvConfig):
             "max_episode_steps": self.episode_length,
         }
 
-    def behavior_rule(self) -> BehaviorRule:
+    def behavior_rule(self) -> MazeBehaviorRule:
         """The checkpoints in the order in which they are first passed."""
         return MazeBehaviorRule(get_layout(self.task or ""))
 
+    @property
+    def draws_scenes(self) -> bool:
+        """In the tasks `scenes` and `scenes_large`: start, goal and doors."""
+        return get_layout(self.task or "").scenes is not None
+
     def start_rule(self) -> StartRule:
-        """The agent's first recorded position, which is all of the maze's state."""
-        return lambda observations: {"agent_pos": observations[OBS_STATE][0]}
+        """The agent's first recorded position and the scene, which are all of the maze's state."""
+        if not self.draws_scenes:
+            return lambda observations: {"agent_pos": observations[OBS_STATE][0]}
+        return lambda observations: {
+            "agent_pos": observations[OBS_STATE][0],
+            "environment_state": observations[OBS_ENV_STATE][0],
+        }
 
     def steps_to_end(self, observations: Mapping[str, np.ndarray]) -> int:
         """Actions until the first state in the goal disc."""
-        reached = in_goal(observations[OBS_STATE], get_layout(self.task or ""))
+        reached = in_goal(observations[OBS_STATE], self.behavior_rule().maze(observations))
         return int(reached.argmax()) if reached.any() else len(reached)
 
     def expected_behavior(self, requested: str, observations: Mapping[str, np.ndarray]) -> str:
@@ -140,8 +151,12 @@ class Maze2DEnvConfig(TaskEnvConfig):
         }
 
     def draw_scene(self, axes: Axes) -> None:
-        """Walls, door numbers and the goal."""
+        """Walls, door numbers and the goal; where scenes differ, all that they have in common."""
         layout = get_layout(self.task or "")
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        if layout.scenes is not None:
+            _draw_ranges(axes, layout, layout.scenes)
+            return
         for wall in layout.walls:
             edges = [0.0]
             for door in sorted(wall.doors, key=lambda door: door.x):
@@ -152,9 +167,22 @@ class Maze2DEnvConfig(TaskEnvConfig):
             edges.append(1.0)
             for left, right in zip(edges[::2], edges[1::2], strict=True):
                 axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")
-        axes.add_patch(Circle(layout.goal, layout.goal_radius, fill=False, color="tab:green", linewidth=2))
-        axes.set(xlim=(0, 1), ylim=(0, 1))
+        goal = Circle(tuple(layout.goal), layout.goal_radius, fill=False, color="tab:green", linewidth=2)
+        axes.add_patch(goal)
 
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
         """All agents in one array."""
         return Maze2DVectorEnv(n_envs, max_episode_steps=self.episode_length, **self._maze_options)
+
+
+def _draw_ranges(axes: Axes, layout: MazeLayout, scenes: Scenes) -> None:
+    """Walls, dotted where doors may be, and the areas of start and goal."""
+    for wall in layout.walls:
+        axes.axhline(wall.y, color="0.15", linewidth=3)
+        for door in wall.doors:
+            reach = scenes.door_shift + door.half_width
+            axes.plot([door.x - reach, door.x + reach], [wall.y, wall.y], color="white", linewidth=3)
+            axes.plot([door.x - reach, door.x + reach], [wall.y, wall.y], ":", color="0.15", linewidth=1)
+            axes.text(float(door.x), wall.y, str(door.checkpoint), color="0.4", ha="center", va="center")
+    for ((left, right), (bottom, top)), colour in ((scenes.start, "tab:blue"), (scenes.goal, "tab:green")):
+        axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=colour, alpha=0.15))

@@ -16,7 +16,7 @@ def move(
     Args:
         positions: (n, 2) positions in the unit square.
         displacements: (n, 2) intended displacement, noise included.
-        layout: The maze.
+        layout: The maze, or those of the n agents.
         sticky_walls: An agent that hits a wall or the border stays where it was; otherwise it slides along.
 
     Returns:

@@ -7,10 +7,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
+from PIL import Image
 
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal, move
 from lerobot_swr.envs.maze2d.layouts import get_layout
 from lerobot_swr.envs.maze2d.rendering import draw_episode, draw_maze
+from lerobot_swr.envs.maze2d.scenes import draw_scene, draw_start, maze_of, scene_names
 
 STARTS = ("fixed", "pseudo_random", "random")
 FPS = 20
@@ -36,52 +38,65 @@ class MazeAgents:
         self.start, self.start_radius = start, start_radius
         self.transition_noise, self.sticky_walls = transition_noise, sticky_walls
 
-    def begin(self, rng: np.random.Generator, options: dict[str, Any] | None) -> np.ndarray:
-        """(2,) start position of one episode: that of ``options["agent_pos"]``, or else a drawn one.
+    def begin(
+        self, rng: np.random.Generator, options: dict[str, Any] | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(2,) start and (S,) scene of one episode: those of ``options``, or else drawn ones.
 
         Raises:
-            ValueError: If the position that is given is not one of the maze.
+            ValueError: If what is given is not one of the maze.
         """
-        given = (options or {}).get("agent_pos")
-        if given is None:
-            return self.draw_start(rng)
-        position = np.asarray(given, dtype=np.float64)
-        if position.shape != (2,) or not ((position >= 0) & (position <= 1)).all():
-            raise ValueError(f"options['agent_pos']={given!r}: expected x and y in the maze, 0 to 1")
-        return position
+        given = options or {}
+        scene, position = given.get("environment_state"), given.get("agent_pos")
+        if scene is None:
+            scene = draw_scene(self.layout, rng)
+        else:
+            scene = _in_maze("environment_state", scene, scene_names(self.layout))
+            if self.layout.scenes is None and not np.allclose(scene, self.layout.goal, atol=1e-6):
+                raise ValueError(f"options['environment_state']={scene}: this maze's goal does not move")
+        if position is None:
+            return self.draw_start(rng), scene
+        return _in_maze("agent_pos", position, ("x", "y")), scene
 
     def draw_start(self, rng: np.random.Generator) -> np.ndarray:
         """(2,) start position of one episode."""
-        start = np.array(self.layout.start)
-        if self.start == "fixed":
-            return start
         if self.start == "random":
             return rng.uniform(0.0, 1.0, size=2)
+        start = draw_start(self.layout, rng)
+        if self.start == "fixed":
+            return start
         return rng.uniform(
             np.maximum(start - self.start_radius, 0.0), np.minimum(start + self.start_radius, 1.0)
         )
 
     def step(
-        self, positions: np.ndarray, actions: np.ndarray, rngs: list[np.random.Generator]
+        self,
+        positions: np.ndarray,
+        actions: np.ndarray,
+        rngs: list[np.random.Generator],
+        scenes: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Apply (n, 2) actions to (n, 2) positions; returns new positions and (n,) goal reached."""
+        """Apply (n, 2) actions to (n, 2) positions in (n, S) scenes; new positions, (n,) goal reached."""
         displacements = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0) * MAX_STEP
         if self.transition_noise > 0:
             noise = np.stack([rng.standard_normal(2) for rng in rngs])
             displacements = displacements + noise * (self.transition_noise * MAX_STEP)
-        positions = move(positions, displacements, self.layout, self.sticky_walls)
-        return positions, in_goal(positions, self.layout)
-
-    def observe(self, positions: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of (n, 2) positions, each (n, 2) float32."""
-        goals = np.broadcast_to(np.array(self.layout.goal, dtype=np.float32), positions.shape)
-        return {"agent_pos": positions.astype(np.float32), "environment_state": goals.copy()}
+        mazes = maze_of(self.layout, scenes)
+        positions = move(positions, displacements, mazes, self.sticky_walls)
+        return positions, in_goal(positions, mazes)
 
     @staticmethod
-    def observation_space() -> spaces.Dict:
+    def observe(positions: np.ndarray, scenes: np.ndarray) -> dict[str, np.ndarray]:
+        """Observations of (n, 2) positions in (n, S) scenes, float32."""
+        return {
+            "agent_pos": positions.astype(np.float32),
+            "environment_state": scenes.astype(np.float32),
+        }
+
+    def observation_space(self) -> spaces.Dict:
         """Space of one agent's observation."""
-        unit_square = spaces.Box(0.0, 1.0, (2,), np.float32)
-        return spaces.Dict({"agent_pos": unit_square, "environment_state": unit_square})
+        sizes = {"agent_pos": 2, "environment_state": len(scene_names(self.layout))}
+        return spaces.Dict({key: spaces.Box(0.0, 1.0, (size,), np.float32) for key, size in sizes.items()})
 
     @staticmethod
     def action_space() -> spaces.Box:
@@ -98,12 +113,17 @@ class Maze2DEnv(gym.Env):
     |---|---|---|---|
     | `agent_pos` | (2,) | x, y of the agent, as shares of the maze's side | 0 to 1 |
     | `environment_state` | (2,) | x, y of the goal | 0 to 1 |
+    | | (2 + D,) | in `scenes` and `scenes_large`: also the x of each door, lowest wall first | 0 to 1 |
 
     **Action** (2,) float32 in -1 to 1: displacement in x and y, in units of 0.02 of the side. Larger values
     are clipped. Walls and the border stop the agent; by default it slides along them.
 
     **Start**: `fixed` (the layout's start), `pseudo_random` (uniform in a square around it, cut at the
     border) or `random` (uniform in the maze); or given by `reset(options={"agent_pos": [x, y]})`.
+
+    **Scenes**: in `scenes` and `scenes_large`, start, goal and doors are drawn from the seed of every episode
+    (`lerobot_swr.envs.maze2d.layouts.Scenes`: the ranges); `fixed` is then the start that was drawn. Goal and
+    doors are given by `reset(options={"environment_state": [...]})`, as they are observed.
 
     **Reward**: 1 when the goal is reached, else 0. **Termination**: goal reached. **Truncation**: by the
     registered step limit (200).
@@ -116,7 +136,8 @@ class Maze2DEnv(gym.Env):
     Versions: v0, first release.
 
     Args:
-        task: Layout: `small` (2 forward behaviours), `medium` (12) or `large` (24).
+        task: Layout: `small` (2 forward behaviours), `medium` (12), `large` (24), or with a scene of its own
+            for every episode `scenes` (2) or `scenes_large` (6).
         start: `fixed`, `pseudo_random` or `random`.
         start_radius: Half the side of the pseudo-random start square, as a share of the maze's side.
         transition_noise: Standard deviation of Gaussian noise on every displacement, in units of the largest
@@ -146,21 +167,24 @@ class Maze2DEnv(gym.Env):
         self.observation_space = self.agents.observation_space()
         self.action_space = self.agents.action_space()
         self.render_mode = render_mode
-        self._maze_picture = draw_maze(self.agents.layout, render_size) if render_mode else None
+        self._render_size = render_size
+        self._maze_picture: Image.Image | None = None
         self._path: list[np.ndarray] = []
+        self._scene = np.zeros(len(scene_names(self.agents.layout)))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Start an episode; the class says what the arguments do."""
         super().reset(seed=seed)
-        self._path = [self.agents.begin(self.np_random, options)]
+        start, self._scene = self.agents.begin(self.np_random, options)
+        self._path, self._maze_picture = [start], None
         return self._observe(), {"is_success": False}
 
     def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Apply a (2,) action."""
         positions, reached = self.agents.step(
-            self._path[-1][None], np.asarray(action)[None], [self.np_random]
+            self._path[-1][None], np.asarray(action)[None], [self.np_random], self._scene[None]
         )
         self._path.append(positions[0])
         success = bool(reached[0])
@@ -168,12 +192,15 @@ class Maze2DEnv(gym.Env):
 
     def render(self) -> np.ndarray | None:
         """(render_size, render_size, 3) uint8 picture of the maze and the path so far."""
-        if self._maze_picture is None:
+        if self.render_mode is None:
             return None
+        if self._maze_picture is None:
+            self._maze_picture = draw_maze(maze_of(self.agents.layout, self._scene), self._render_size)
         return draw_episode(self._maze_picture, np.stack(self._path))
 
     def _observe(self) -> dict[str, np.ndarray]:
-        return {key: value[0] for key, value in self.agents.observe(self._path[-1][None]).items()}
+        observed = self.agents.observe(self._path[-1][None], self._scene[None])
+        return {key: value[0] for key, value in observed.items()}
 
 
 class Maze2DVectorEnv(gym.vector.VectorEnv):
@@ -199,6 +226,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
         self._positions: np.ndarray = np.zeros((num_envs, 2))
+        self._scenes: np.ndarray = np.zeros((num_envs, len(scene_names(self.agents.layout))))
         self._terminated = np.zeros(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=int)
 
@@ -217,16 +245,16 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
                 new if use else old for use, new, old in zip(chosen, fresh, self._rngs, strict=True)
             ]
         for i in np.flatnonzero(chosen):
-            self._positions[i] = self.agents.begin(self._rngs[i], options)
+            self._positions[i], self._scenes[i] = self.agents.begin(self._rngs[i], options)
         self._terminated[chosen] = False
         self._steps[chosen] = 0
-        return self.agents.observe(self._positions), {"is_success": self._terminated.copy()}
+        return self.agents.observe(self._positions, self._scenes), {"is_success": self._terminated.copy()}
 
     def step(
         self, actions: np.ndarray
     ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Apply (n, 2) actions to the agents that are still under way."""
-        moved, reached = self.agents.step(self._positions, actions, self._rngs)
+        moved, reached = self.agents.step(self._positions, actions, self._rngs, self._scenes)
         under_way = ~self._terminated
         self._positions = np.where(under_way[:, None], moved, self._positions)
         reward = (reached & under_way).astype(np.float64)
@@ -234,7 +262,13 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         self._steps += 1
         truncated = (self._steps >= self._max_episode_steps) & ~self._terminated
         info = {"is_success": self._terminated.copy()}
-        return self.agents.observe(self._positions), reward, self._terminated.copy(), truncated, info
+        return (
+            self.agents.observe(self._positions, self._scenes),
+            reward,
+            self._terminated.copy(),
+            truncated,
+            info,
+        )
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """The attribute or method result `name`, once per agent."""
@@ -244,3 +278,11 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """The attribute `name`, once per agent."""
         return self.call(name)
+
+
+def _in_maze(key: str, given: Any, meanings: tuple[str, ...]) -> np.ndarray:
+    """(n,) float64 of what ``reset(options=...)`` gives for `key`: numbers of 0 to 1."""
+    numbers = np.asarray(given, dtype=np.float64)
+    if numbers.shape != (len(meanings),) or not ((numbers >= 0) & (numbers <= 1)).all():
+        raise ValueError(f"options[{key!r}]={given!r}: expected {' and '.join(meanings)} in the maze, 0 to 1")
+    return numbers

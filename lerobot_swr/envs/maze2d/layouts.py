@@ -1,6 +1,6 @@
 """The mazes as plain literals: walls with numbered doors in the unit square."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,12 +11,12 @@ class Door:
 
     Attributes:
         checkpoint: The number that names the door in a behaviour label; one digit, 0 is the goal.
-        x: Centre of the gap, as a share of the maze's side.
+        x: Centre of the gap, as a share of the maze's side; (n,) for n mazes at once.
         half_width: Half the width of the gap, in the same unit.
     """
 
     checkpoint: int
-    x: float
+    x: float | np.ndarray
     half_width: float
 
 
@@ -29,26 +29,45 @@ class Wall:
 
 
 @dataclass(frozen=True)
+class Scenes:
+    """What every episode draws for itself, uniformly.
+
+    Attributes:
+        start: Ranges of x and y of the start.
+        goal: Ranges of x and y of the goal.
+        door_shift: Doors lie within this distance of the place that the layout gives them.
+    """
+
+    start: tuple[tuple[float, float], tuple[float, float]]
+    goal: tuple[tuple[float, float], tuple[float, float]]
+    door_shift: float
+
+
+@dataclass(frozen=True)
 class MazeLayout:
     """A maze in the unit square; x grows to the right, y upwards.
 
     Attributes:
         walls: From the start (bottom) to the goal (top).
         start: (2,) start position.
-        goal: (2,) centre of the goal disc.
+        goal: (2,) centre of the goal disc; (n, 2) for n mazes at once.
         goal_radius: The goal is reached at this distance from its centre or nearer.
+        scenes: Where start, goal and doors differ from episode to episode; None where all are the same.
     """
 
     walls: tuple[Wall, ...]
     start: tuple[float, float] = (0.5, 0.08)
-    goal: tuple[float, float] = (0.5, 0.92)
+    goal: tuple[float, float] | np.ndarray = (0.5, 0.92)
     goal_radius: float = 0.05
+    scenes: Scenes | None = None
 
     @property
     def wall_y(self) -> np.ndarray:
         """(W,) heights of the walls."""
         return np.array([wall.y for wall in self.walls])
 
+
+_SCENES = Scenes(start=((0.1, 0.9), (0.06, 0.16)), goal=((0.1, 0.9), (0.84, 0.94)), door_shift=0.13)
 
 LAYOUTS = {
     # 2 forward behaviours.
@@ -69,6 +88,19 @@ LAYOUTS = {
             Wall(0.60, (Door(3, 0.27, 0.09), Door(4, 0.73, 0.09))),
             Wall(0.80, (Door(1, 0.30, 0.09), Door(2, 0.70, 0.09))),
         )
+    ),
+    # 2 forward behaviours, in scenes that differ.
+    "scenes": MazeLayout(
+        walls=(Wall(0.50, (Door(1, 0.28, 0.07), Door(2, 0.72, 0.07))),),
+        scenes=_SCENES,
+    ),
+    # 2 * 3 = 6 forward behaviours, in scenes that differ.
+    "scenes_large": MazeLayout(
+        walls=(
+            Wall(0.36, (Door(4, 0.28, 0.07), Door(5, 0.72, 0.07))),
+            Wall(0.64, (Door(1, 0.18, 0.06), Door(2, 0.50, 0.06), Door(3, 0.82, 0.06))),
+        ),
+        scenes=replace(_SCENES, door_shift=0.08),
     ),
 }
 
