@@ -87,7 +87,7 @@ def test_aligning_is_measured_in_new_scenes_and_in_one(settings, demos):
 
 
 def test_scenes_are_told_apart_in_a_suite_of_their_own(settings, demos):
-    """Every policy in own scenes and in new ones, wzbc also with beta 2; a dataset of one scene is refused."""
+    """Every policy in own scenes and new ones, wzbc also with beta 2; a dataset of one scene is refused."""
     mazes = dataclasses.replace(demos, env={"type": "maze2d", "task": "scenes"})
     cells = [c for c in suite_cells("scenes", settings, [mazes]) if c.kind == "evaluate"]
     named = [c.labels.policy.replace(" hidden_dim=16", "") for c in cells]

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import save_checkpoint
+from conftest import make_batch, save_checkpoint
 from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import make_policy
@@ -19,6 +19,7 @@ from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.evaluation.checkpoint import Checkpoint, load_demonstrations
 from lerobot_swr.evaluation.scenes import evaluate_scenes, run_in_scenes
+from lerobot_swr.evaluation.swaps import swapped_actions
 from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
 from lerobot_swr.run_context import running
 from lerobot_swr.styles.cookbook import StyleCookbook
@@ -193,10 +194,10 @@ def test_the_command_reports_success_fidelity_and_blind_replay(
         ),
     ],
 )
-def test_what_cannot_be_measured_is_refused_before_any_work(run_command, capsys, flags, message):
+def test_what_cannot_be_measured_is_refused_before_any_work(run_command, two_ways, capsys, flags, message):
     """Tasks with one scene, unknown kinds, and flags that would have no effect."""
     with pytest.raises(SystemExit):
-        run_command(eval_command.main, "--policy.path=nowhere", "--dataset.root=nowhere", *flags)
+        run_command(eval_command.main, "--policy.path=nowhere", f"--dataset.root={two_ways}", *flags)
     assert message in capsys.readouterr().err
 
 
@@ -217,3 +218,17 @@ def test_the_arms_contexts_are_scenes(tmp_path):
         assert np.allclose(box, recorded, atol=1e-3) == (kind == "own")
         assert found.replays[0].success == (kind == "own")
         assert not found.rollouts[0].success
+
+
+def test_swapping_tells_what_a_network_obeys(make_tiny_policy):
+    """Without weights on z only the observation moves the actions, and the other way round."""
+    for kept, silent in (("observation", slice(4, None)), ("style", slice(0, 4))):
+        policy = make_tiny_policy("zbc", style_init_scale=1.0).eval()
+        first = next(layer for layer in policy.backbone.modules() if isinstance(layer, torch.nn.Linear))
+        with torch.no_grad():
+            first.weight[:, silent] = 0
+        moved = swapped_actions(policy, make_batch())
+        assert getattr(moved, kept) > 0
+        assert moved.style + moved.observation == getattr(moved, kept)
+    with pytest.raises(ValueError, match="a 'bc' policy has no styles to swap"):
+        swapped_actions(make_tiny_policy("bc"), make_batch())

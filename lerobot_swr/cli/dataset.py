@@ -41,6 +41,11 @@ class DatasetCommand:
     n_episodes: int | None = None
     # Seed of the demonstrations.
     seed: int = 0
+    # Add what a camera sees (observation.images.top), for policies that are used with --env.obs_type=both.
+    images: bool = False
+    # What the environment shows that the dataset is for (--env.obs_type): state, both (the same as images) or
+    # pixels: pictures, and as observation.state the change since the last step instead of places.
+    obs_type: str | None = None
     # Name of the dataset for LeRobot; default: local/<task>.
     repo_id: str | None = None
     # Replace a dataset that is already in the folder.
@@ -61,7 +66,10 @@ def write(cfg: DatasetCommand) -> None:
         recipe = get_recipe(cfg.task)
     if cfg.n_episodes is not None:
         recipe = recipe.with_episodes(cfg.n_episodes)
-    histogram = write_dataset(recipe, cfg.root, cfg.seed, cfg.repo_id, cfg.overwrite)
+    obs_type = cfg.obs_type or ("both" if cfg.images else "state")
+    if cfg.images and obs_type == "state":
+        raise ValueError("--images=true and --obs_type=state exclude each other: leave out one of them")
+    histogram = write_dataset(recipe, cfg.root, cfg.seed, cfg.repo_id, cfg.overwrite, obs_type)
     total = sum(histogram.values())
     print(f"{total} episodes of {recipe.name} in {cfg.root}")
     for behavior, count in histogram.most_common():

@@ -34,6 +34,7 @@ from lerobot_swr.evaluation.blending import format_blends, run_blends
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
     check_environment,
+    in_simulation,
     load_checkpoint,
     load_demonstrations,
     load_reference,
@@ -139,11 +140,11 @@ def _load(cfg: EvalCommand) -> tuple[Checkpoint, Trajectories]:
         playback = playback_checkpoint(trajectories, sampling, cfg.dataset.episodes)  # type: ignore[arg-type]
         return playback, trajectories
     checkpoint = load_checkpoint(cfg.policy, cfg.rename_map)
-    if cfg.env is not None:
-        check_environment(cfg.env, checkpoint.shapes, cfg.rename_map, "the checkpoint")
-    return checkpoint, load_reference(
-        cfg.dataset, checkpoint, needs_actions=cfg.env is None or cfg.scenes is not None
-    )
+    if cfg.env is None:
+        return checkpoint, load_reference(cfg.dataset, checkpoint, needs_actions=True)
+    check_environment(cfg.env, checkpoint.shapes, cfg.rename_map, "the checkpoint")
+    reference = load_reference(cfg.dataset, checkpoint, needs_actions=cfg.scenes is not None)
+    return checkpoint, in_simulation(reference)
 
 
 def _replay(cfg: EvalCommand) -> None:

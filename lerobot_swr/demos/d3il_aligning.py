@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from lerobot_swr.demos.arm_pictures import PICTURE_SIZE, aligning_pictures
 from lerobot_swr.demos.box_handler import BoxHandler, Habits
 from lerobot_swr.demos.box_steering import INSIDE_CORNER, OUTSIDE_FACE, Gains
 from lerobot_swr.demos.parallel_generation import generate
@@ -118,6 +119,8 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
         n_episodes=len(behaviors),
         demonstrations=lambda seed: map(job(seed), range(len(behaviors))),
         behavior_rule=aligning_behavior,
+        pictures=aligning_pictures,
+        picture_size=PICTURE_SIZE,
         resumable_demonstrations=lambda seed, work_dir: generate(job(seed), len(behaviors), work_dir),
     )
 

@@ -12,6 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
+from lerobot_swr.demos.arm_pictures import PICTURE_SIZE, avoiding_pictures
 from lerobot_swr.demos.parallel_generation import generate
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.envs.d3il.behavior import AVOIDING_BEHAVIORS, avoiding_behavior, gaps_of_behavior
@@ -156,6 +157,8 @@ def _recipe(name: str, counts: dict[str, int]) -> DatasetRecipe:
         n_episodes=n_episodes,
         demonstrations=lambda seed: map(job(seed), range(n_episodes)),
         behavior_rule=avoiding_behavior,
+        pictures=avoiding_pictures,
+        picture_size=PICTURE_SIZE,
         resumable_demonstrations=lambda seed, work_dir: generate(job(seed), n_episodes, work_dir),
     )
 

@@ -11,13 +11,20 @@ from pathlib import Path
 import numpy as np
 from datasets import disable_progress_bars
 from lerobot.datasets import LeRobotDataset
+from lerobot.utils.constants import ACTION
 from tqdm import tqdm
 
+from lerobot_swr.demos.columns import check_columns, feature_columns, frame_columns
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 
 
 def write_dataset(
-    recipe: DatasetRecipe, root: Path, seed: int = 0, repo_id: str | None = None, overwrite: bool = False
+    recipe: DatasetRecipe,
+    root: Path,
+    seed: int = 0,
+    repo_id: str | None = None,
+    overwrite: bool = False,
+    obs_type: str = "state",
 ) -> Counter[str]:
     """Write a dataset into `root`.
 
@@ -32,13 +39,17 @@ def write_dataset(
         seed: Seed of the demonstrations; the same seed gives the same data files, byte for byte.
         repo_id: Name of the dataset, by default ``local/<recipe name>``.
         overwrite: Replace a dataset that is already there.
+        obs_type: What the environment shows for which the dataset is made: ``state``, ``both`` or ``pixels``,
+            see `lerobot_swr.envs.observed`.
 
     Returns:
         The behaviour histogram of the dataset.
 
     Raises:
         FileExistsError: If `root` exists and is not to be overwritten, or is no dataset.
+        ValueError: If the recipe has no pictures for what the environment shows.
     """
+    check_columns(recipe, obs_type)
     check_root(root, overwrite)
     work_dir = root.parent / f".{root.name}-{recipe.name}-seed{seed}"
     work_dir.mkdir(parents=True, exist_ok=True)
@@ -52,10 +63,7 @@ def write_dataset(
         dataset = LeRobotDataset.create(
             repo_id=repo_id or f"local/{recipe.name}",
             fps=recipe.fps,
-            features={
-                key: {"dtype": "float32", "shape": (len(names),), "names": list(names)}
-                for key, names in recipe.features.items()
-            },
+            features=feature_columns(recipe, obs_type),
             root=Path(workspace) / "dataset",
             robot_type=recipe.robot_type,
             use_videos=False,
@@ -68,7 +76,7 @@ def write_dataset(
                 desc=recipe.name,
                 unit="episode",
             ):
-                _add_episode(dataset, demonstration, recipe.instruction)
+                _add_episode(dataset, frame_columns(recipe, demonstration, obs_type), recipe.instruction)
                 histogram[recipe.behavior_rule(demonstration.observations)] += 1
         finally:
             dataset.finalize()  # else the writer would do so later, in a folder that is gone by then
@@ -97,10 +105,12 @@ def _removed_if_useless(work_dir: Path) -> Iterator[None]:
         raise
 
 
-def _add_episode(dataset: LeRobotDataset, demonstration: Demonstration, instruction: str) -> None:
-    columns = {**demonstration.observations, "action": demonstration.actions}
-    for t in range(len(demonstration.actions)):
-        frame = {key: np.asarray(column[t], dtype=np.float32) for key, column in columns.items()}
+def _add_episode(dataset: LeRobotDataset, columns: dict[str, np.ndarray], instruction: str) -> None:
+    for t in range(len(columns[ACTION])):
+        frame = {
+            key: column[t] if column.dtype == np.uint8 else np.asarray(column[t], dtype=np.float32)
+            for key, column in columns.items()
+        }
         dataset.add_frame({**frame, "task": instruction})
     dataset.save_episode()
 

@@ -6,15 +6,18 @@ were fixed before any method was trained on the datasets; units are shares of th
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.interpolate import PchipInterpolator
 
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
+from lerobot_swr.envs.maze2d.camera import MazeCamera
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal
-from lerobot_swr.envs.maze2d.env import FPS, INSTRUCTION, MazeAgents
+from lerobot_swr.envs.maze2d.env import CAMERA_SIZE, FPS, INSTRUCTION, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, get_layout
 from lerobot_swr.envs.maze2d.scenes import draw_scene, draw_start, maze_of, scene_names
 
@@ -190,8 +193,14 @@ def _recipe(
         n_episodes=len(behaviors),
         demonstrations=lambda seed: demonstrate(task, behaviors, speed, seed, **variation),
         behavior_rule=MazeBehaviorRule(get_layout(task)),
+        pictures=partial(_seen, MazeCamera(get_layout(task), CAMERA_SIZE)),
+        picture_size=(CAMERA_SIZE, CAMERA_SIZE),
         resized=resized,
     )
+
+
+def _seen(camera: MazeCamera, demonstration: Demonstration) -> np.ndarray:
+    return camera.pictures(*(demonstration.observations[key] for key in (OBS_STATE, OBS_ENV_STATE)))
 
 
 def _scenes_recipe(name: str, task: str, ways: Sequence[str], n_episodes: int) -> DatasetRecipe:

@@ -40,6 +40,9 @@ class DatasetRecipe:
         resumable_demonstrations: For a source that takes long, if not None: the same episodes, made on all
             cores; finished ones are kept in the folder given, and those that an interrupted run with the same
             seed left there are used.
+        pictures: What the task's camera sees in every state of a demonstration, (T, height, width, 3) uint8;
+            None where there is no camera.
+        picture_size: Height and width of these.
         resized: The same recipe for another number of episodes; None where it has one number only.
     """
 
@@ -52,6 +55,8 @@ class DatasetRecipe:
     demonstrations: Callable[[int], Iterator[Demonstration]]
     behavior_rule: BehaviorRule
     resumable_demonstrations: Callable[[int, Path], Iterator[Demonstration]] | None = None
+    pictures: Callable[[Demonstration], np.ndarray] | None = None
+    picture_size: tuple[int, int] = (0, 0)
     resized: "Callable[[int], DatasetRecipe] | None" = None
 
     def with_episodes(self, n_episodes: int) -> "DatasetRecipe":

@@ -1,6 +1,6 @@
 """Loads any LeRobot checkpoint, and the dataset that it is compared with."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_PREFIX, OBS_STA
 
 from lerobot_swr.dataset_checks import Shapes, check_dimensions, check_format, describe_features
 from lerobot_swr.dataset_files import is_numeric
+from lerobot_swr.envs.observed import SIMULATOR, as_simulated
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 
 
@@ -112,8 +113,16 @@ def load_checkpoint(config: PreTrainedConfig, rename_map: dict[str, str] | None 
 
 
 def load_demonstrations(meta: LeRobotDatasetMetadata) -> Trajectories:
-    """A dataset's states and actions, and its other low-dimensional observations that are usable."""
-    return load_trajectories(meta, [OBS_STATE, ACTION], _low_dimensional(meta))
+    """A dataset's states and actions, and its other low-dimensional observations that are usable.
+
+    Of data for camera policies they are the simulator's, see `in_simulation`.
+    """
+    return in_simulation(load_trajectories(meta, [OBS_STATE, ACTION], _low_dimensional(meta)))
+
+
+def in_simulation(trajectories: Trajectories) -> Trajectories:
+    """Episodes as the simulator knows them, where the policy's own observations do not tell places."""
+    return replace(trajectories, columns=as_simulated(trajectories.columns))
 
 
 def load_reference(
@@ -184,5 +193,5 @@ def _low_dimensional(meta: LeRobotDatasetMetadata) -> list[str]:
     return [
         key
         for key, ft in meta.features.items()
-        if (key.startswith(OBS_PREFIX) or key == ACTION) and is_numeric(ft)
+        if (key.startswith((OBS_PREFIX, SIMULATOR)) or key == ACTION) and is_numeric(ft)
     ]

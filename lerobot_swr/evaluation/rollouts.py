@@ -11,6 +11,7 @@ from lerobot.scripts.lerobot_eval import rollout
 from lerobot.utils.random_utils import set_seed
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.observed import as_simulated
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.styles.cookbook import BLENDED
@@ -69,9 +70,13 @@ class StateRecorder(gym.vector.VectorWrapper):
         return self.env.get_attr(name)  # type: ignore[attr-defined]
 
     def episodes(self) -> list[dict[str, np.ndarray]]:
-        """Observations of each sub-environment's first episode, by LeRobot's feature names, (T + 1, d)."""
+        """States of each sub-environment's first episode, by LeRobot's feature names, (T + 1, d).
+
+        They are the simulator's, also where a policy sees pictures instead.
+        """
         stacked = [{key: np.stack([row[key] for row in rows]) for key in rows[0]} for rows in self._recorded]
-        return [{k: v.numpy() for k, v in preprocess_observation(episode).items()} for episode in stacked]
+        named = [{k: v.numpy() for k, v in preprocess_observation(episode).items()} for episode in stacked]
+        return list(map(as_simulated, named))
 
     def _rows(self, observations: dict) -> list[dict[str, np.ndarray]]:
         low_dimensional = _low_dimensional(observations)

@@ -26,7 +26,7 @@ from lerobot_swr.sampling import PartnerSampler
 from lerobot_swr.scene_variation import SceneVariation, scene_variation
 from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.encoding import Frames
-from lerobot_swr.styles.table import OUTCOMES, StyleTable, make_nearest_table
+from lerobot_swr.styles.table import LABELLED_BY, OUTCOMES, StyleTable, make_nearest_table
 from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
 
 logger = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ def read_training_data(
 
 def read_demonstrations(config: StateConfig, meta: LeRobotDatasetMetadata) -> Trajectories:
     """What a policy takes from a dataset that it need not train on: observations, actions, outcomes."""
-    return load_trajectories(meta, [*config.observation_keys, ACTION], OUTCOMES)
+    return load_trajectories(meta, [*config.observation_keys, ACTION], (*OUTCOMES, *LABELLED_BY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +158,7 @@ class TrainingData:
                 checkpoint's.
         """
         run = RunContext.current(meta)
-        trajectories = read_training_data(config, meta, run, OUTCOMES)
+        trajectories = read_training_data(config, meta, run, (*OUTCOMES, *LABELLED_BY))
         fingerprint, known = trajectories.fingerprint([OBS_STATE]), config.dataset_fingerprint
         is_new = known is not None and known != fingerprint
         if is_new and run.resuming:

@@ -11,6 +11,7 @@ from lerobot_swr.envs.task import Task, task_of
 from lerobot_swr.evaluation.checkpoint import (
     Checkpoint,
     DatasetSource,
+    in_simulation,
     load_checkpoint,
     load_demonstrations,
     load_reference,
@@ -67,7 +68,7 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
         folder = checkpoint_folder(cell.needs, store, seed)
         checkpoint = load_policy(folder, protocol, definition["style_filter"])
         # refuses another dataset than the training's
-        trajectories = load_reference(source, checkpoint)
+        trajectories = in_simulation(load_reference(source, checkpoint))
     env_cfg = environment(definition["env"])
     task = task_of(env_cfg)
     rule = task.behavior_rule()

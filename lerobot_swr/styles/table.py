@@ -17,9 +17,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
-from lerobot.utils.constants import OBS_STATE, REWARD
+from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE, REWARD
 
 from lerobot_swr.behaviors import BehaviorRule, dataset_behavior_rule, load_style_metrics
+from lerobot_swr.envs.observed import SIMULATED, as_simulated
 from lerobot_swr.similarity import Similarity
 from lerobot_swr.styles.filters import Value, column_kind, select
 from lerobot_swr.trajectories import Trajectories
@@ -30,6 +31,9 @@ NEIGHBOURS = "nearest others"  # a column of the file; metrics have names withou
 FILTERS = b"filters"  # metadata of the file
 SUCCESS = "next.success"
 OUTCOMES = (REWARD, SUCCESS)
+"""Columns of the data about how episodes went."""
+LABELLED_BY = (OBS_ENV_STATE, *SIMULATED)
+"""Columns by which rules label an episode, also where the policy does not look at them."""
 OUTCOME_COLUMNS = frozenset({"return", "success"})
 MAX_NEIGHBOURS = 50
 
@@ -196,7 +200,7 @@ def _measured(name: str, metric: Metric, trajectories: Trajectories) -> list[Val
     values: list[Value] = []
     for i, episode in enumerate(trajectories.episodes()):
         try:
-            value: Any = metric(episode)
+            value: Any = metric(as_simulated(episode))
         except Exception as error:  # whatever a user's function raises
             raise ValueError(f"style_metrics: {name!r} fails on episode {i}: {error!r}") from error
         value = value.item() if isinstance(value, np.generic | np.ndarray) and np.size(value) == 1 else value

@@ -17,6 +17,7 @@ from lerobot_swr.envs.d3il.layouts import (
     ALIGNING_START_TOOL,
     ANGLE_RANGE,
     BOX_POSITION_RANGE,
+    CAMERA_SIZE,
     TARGET_POSITION_RANGE,
 )
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
@@ -96,6 +97,8 @@ class AligningEnv(ArmTask):
         start_radius: See `ArmPerturbations`.
         action_noise: See `ArmPerturbations`.
         box_push: See `ArmPerturbations`.
+        obs_type: `state`, `pixels` or `both`, see `lerobot_swr.envs.observed`.
+        camera_size: Side of the observed pictures, in pixels.
     """
 
     task = "aligning"
@@ -109,6 +112,8 @@ class AligningEnv(ArmTask):
         start_radius: float = 0.0,
         action_noise: float = 0.0,
         box_push: float = 0.0,
+        obs_type: str = "state",
+        camera_size: int = CAMERA_SIZE,
     ):
         super().__init__(
             model=aligning_model(),
@@ -119,6 +124,8 @@ class AligningEnv(ArmTask):
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
+            obs_type=obs_type,
+            camera_size=camera_size,
         )
         self._box = self._simulation.data.joint("box").qpos
         self._box_velocity = self._simulation.data.joint("box").qvel
@@ -144,8 +151,12 @@ class AligningEnv(ArmTask):
     def _scene_state(self) -> np.ndarray:
         return np.concatenate([self._box, self._target]).astype(np.float32)
 
-    def _observation(self) -> Observation:
+    def _numbers(self) -> dict[str, np.ndarray]:
         return {"agent_pos": self._agent_pos(), "environment_state": self._scene_state()}
+
+    def _place_objects(self, data: "mujoco.MjData", environment_state: np.ndarray) -> None:
+        data.joint("box").qpos[:] = environment_state[:7]
+        data.mocap_pos[0], data.mocap_quat[0] = environment_state[7:10], environment_state[10:14]
 
     def _judge(self) -> None:
         """Nothing to remember: success and mode are read from the present state."""

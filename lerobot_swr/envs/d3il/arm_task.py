@@ -1,7 +1,8 @@
 """What the two D3IL tasks share as Gymnasium environments: the set-point, the clock and the pictures."""
 
 import abc
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, SupportsFloat
 
 import gymnasium as gym
@@ -10,10 +11,11 @@ import numpy as np
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, FPS
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
-from lerobot_swr.envs.d3il.rendering import OffscreenCamera
+from lerobot_swr.envs.d3il.rendering import OffscreenCamera, shared_camera
 from lerobot_swr.envs.d3il.simulation import SETTLING_STEPS, ArmSimulation
+from lerobot_swr.envs.observed import check_obs_type, observation_space, observed, shows_pictures
 
-Observation = dict[str, np.ndarray]
+Observation = dict[str, Any]
 
 _OBSERVATION_BOUND = (
     100.0  # metres; far outside of anything that can be reached, but finite as Gymnasium wants it
@@ -32,6 +34,8 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         render_mode: ``"rgb_array"`` or None.
         render_height: Of the pictures, in pixels.
         render_width: Of the pictures, in pixels.
+        obs_type: What is observed, see `lerobot_swr.envs.observed`.
+        camera_size: Side of the observed pictures, in pixels.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  as Gymnasium declares it
@@ -48,7 +52,10 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         render_mode: str | None,
         render_height: int,
         render_width: int,
+        obs_type: str,
+        camera_size: int,
     ):
+        check_obs_type(obs_type)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: the D3IL tasks know None and 'rgb_array'")
         self.render_mode = render_mode
@@ -60,11 +67,14 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         self._desired = self._start_tool.copy()
         self._n_axes = n_axes
         self.action_space = gym.spaces.Box(-ACTION_LIMIT_M, ACTION_LIMIT_M, (n_axes,), np.float32)
-        self.observation_space = gym.spaces.Dict(  # type: ignore[assignment]
-            {
-                key: gym.spaces.Box(-_OBSERVATION_BOUND, _OBSERVATION_BOUND, (size,), np.float32)
-                for key, size in (("agent_pos", 2 * n_axes), ("environment_state", environment_state_size))
-            }
+        numbers = {
+            key: gym.spaces.Box(-_OBSERVATION_BOUND, _OBSERVATION_BOUND, (size,), np.float32)
+            for key, size in (("agent_pos", 2 * n_axes), ("environment_state", environment_state_size))
+        }
+        self._obs_type, self._camera_size = obs_type, camera_size
+        self._before: np.ndarray | None = None
+        self.observation_space = observation_space(  # type: ignore[assignment]
+            obs_type, numbers, (camera_size, camera_size)
         )
 
     def reset(
@@ -77,7 +87,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         """
         super().reset(seed=seed)
         options = options or {}
-        self._desired = self._start_tool.copy()
+        self._desired, self._before = self._start_tool.copy(), None
         self._begin_episode(options)
         if options.get("agent_pos") is not None:
             axes = ("x", "y", "z")[: self._n_axes]
@@ -122,6 +132,26 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
             self._camera.close()
             self._camera = None
 
+    def picture_of(self, numbers: Mapping[str, np.ndarray]) -> np.ndarray:
+        """(camera_size, camera_size, 3) uint8 of the arm as it is, and of the objects where they are given.
+
+        Args:
+            numbers: An observation's ``environment_state``.
+        """
+        shown = copy.copy(self._simulation.data)
+        self._place_objects(shown, numbers["environment_state"])
+        mujoco.mj_forward(self._simulation.model, shown)
+        return shared_camera(self._simulation.model, self._camera_size).picture(shown)
+
+    def _observation(self) -> Observation:
+        numbers = self._numbers()
+        before = numbers["agent_pos"] if self._before is None else self._before
+        self._before = numbers["agent_pos"]
+        if not shows_pictures(self._obs_type):
+            return numbers
+        camera = shared_camera(self._simulation.model, self._camera_size)
+        return observed(self._obs_type, numbers, before, camera.picture(self._simulation.data))
+
     def _agent_pos(self) -> np.ndarray:
         """(2 n_axes,) desired, then actual tool position."""
         actual = self._simulation.tool_position[: self._n_axes]
@@ -132,7 +162,11 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         """Reset the simulation and what is remembered of the episode."""
 
     @abc.abstractmethod
-    def _observation(self) -> Observation: ...
+    def _numbers(self) -> dict[str, np.ndarray]:
+        """``agent_pos`` and ``environment_state``."""
+
+    def _place_objects(self, data: "mujoco.MjData", environment_state: np.ndarray) -> None:
+        """Put what can move where an observation says; by default nothing can."""
 
     @abc.abstractmethod
     def _judge(self) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_swr.envs.d3il.arm import ROD_GEOM
-from lerobot_swr.envs.d3il.arm_task import ArmTask, Observation
+from lerobot_swr.envs.d3il.arm_task import ArmTask
 from lerobot_swr.envs.d3il.behavior import Gaps, gaps_after, mode_bits
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import (
@@ -14,6 +14,7 @@ from lerobot_swr.envs.d3il.layouts import (
     AVOIDING_SCENE,
     AVOIDING_START_JOINTS,
     AVOIDING_START_TOOL,
+    CAMERA_SIZE,
     FINISH_LINE_Y,
     OBSTACLES,
 )
@@ -59,6 +60,8 @@ class AvoidingEnv(ArmTask):
         render_width: Of the pictures, in pixels.
         start_radius: See `ArmPerturbations`.
         action_noise: See `ArmPerturbations`.
+        obs_type: `state`, `pixels` or `both`, see `lerobot_swr.envs.observed`.
+        camera_size: Side of the observed pictures, in pixels.
     """
 
     task = "avoiding"
@@ -71,6 +74,8 @@ class AvoidingEnv(ArmTask):
         render_width: int = 640,
         start_radius: float = 0.0,
         action_noise: float = 0.0,
+        obs_type: str = "state",
+        camera_size: int = CAMERA_SIZE,
     ):
         super().__init__(
             model=avoiding_model(),
@@ -81,6 +86,8 @@ class AvoidingEnv(ArmTask):
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
+            obs_type=obs_type,
+            camera_size=camera_size,
         )
         model = self._simulation.model
         self._rod = model.geom(ROD_GEOM).id
@@ -94,7 +101,7 @@ class AvoidingEnv(ArmTask):
         self._gaps = (None, None, None)
         self._collision = self._success = False
 
-    def _observation(self) -> Observation:
+    def _numbers(self) -> dict[str, np.ndarray]:
         return {"agent_pos": self._agent_pos(), "environment_state": AVOIDING_SCENE.copy()}
 
     def _judge(self) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
@@ -25,6 +26,7 @@ from lerobot_swr.envs.d3il.layouts import (
     ALIGNING_EPISODE_LENGTH,
     AVOIDING_EPISODE_LENGTH,
     BOX_POSITION_RANGE,
+    CAMERA_SIZE,
     FINISH_LINE_Y,
     FPS,
     OBSTACLES,
@@ -32,6 +34,7 @@ from lerobot_swr.envs.d3il.layouts import (
 )
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.d3il.recorded_starts import aligning_start, avoiding_start
+from lerobot_swr.envs.observed import PICTURE_NAMES, check_obs_type, picture_features, shows_pictures
 from lerobot_swr.envs.task import StartRule
 from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
 
@@ -72,6 +75,12 @@ class D3ILEnvConfig(TaskEnvConfig):
     # Once per episode the box is pushed so that, standing free, it slides this far, in metres (aligning).
     box_push: float = 0.0
 
+    # What is observed: "state" (numbers), "both" (numbers and a camera) or "pixels" (the camera, and as
+    # observation.state how far the set-point and the tool have moved in the last step).
+    obs_type: str = "state"
+    # Side of the camera's pictures, in pixels.
+    camera_size: int = CAMERA_SIZE
+
     # Size of the rendered picture, in pixels.
     render_height: int = 480
     render_width: int = 640
@@ -83,6 +92,7 @@ class D3ILEnvConfig(TaskEnvConfig):
             ACTION: ACTION,
             "agent_pos": OBS_STATE,
             "environment_state": OBS_ENV_STATE,
+            **PICTURE_NAMES,
         }
     )
 
@@ -98,6 +108,9 @@ class D3ILEnvConfig(TaskEnvConfig):
         if self.box_push and self.task != "aligning":
             raise ValueError(f"box_push={self.box_push}: the {self.task} task has no box")
         ArmPerturbations(self.start_radius, self.action_noise, self.box_push)
+        check_obs_type(self.obs_type)
+        if self.camera_size < 16:
+            raise ValueError(f"camera_size={self.camera_size}: expected at least 16 pixels")
         if self.episode_length is None:
             self.episode_length = EPISODE_LENGTHS[self.task]
         if self.episode_length < 1:
@@ -107,7 +120,10 @@ class D3ILEnvConfig(TaskEnvConfig):
             ACTION: PolicyFeature(type=FeatureType.ACTION, shape=(action,)),
             "agent_pos": PolicyFeature(type=FeatureType.STATE, shape=(state,)),
             "environment_state": PolicyFeature(type=FeatureType.ENV, shape=(environment_state,)),
+            **picture_features(self.obs_type, self.camera_size, self.camera_size),
         }
+        if self.obs_type == "pixels":
+            del self.features["environment_state"]
 
     @property
     def gym_id(self) -> str:
@@ -124,6 +140,8 @@ class D3ILEnvConfig(TaskEnvConfig):
             "render_width": self.render_width,
             "start_radius": self.start_radius,
             "action_noise": self.action_noise,
+            "obs_type": self.obs_type,
+            "camera_size": self.camera_size,
             **push,
             "max_episode_steps": self.episode_length,
         }
@@ -185,8 +203,11 @@ class D3ILEnvConfig(TaskEnvConfig):
         axes.set(xlabel="y (m)", ylabel="x (m)")
 
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
-        """All environments in this process, stepped by one thread per core."""
+        """All environments in this process, stepped by one thread per core; with a camera by this one."""
         make_one = partial(
             gym.make, self.gym_id, disable_env_checker=self.disable_env_checker, **self.gym_kwargs
         )
-        return ThreadVectorEnv([freeze_after_episode_end(make_one) for _ in range(n_envs)])
+        env_fns = [freeze_after_episode_end(make_one) for _ in range(n_envs)]
+        if shows_pictures(self.obs_type):
+            return SyncVectorEnv(env_fns, autoreset_mode=AutoresetMode.SAME_STEP)
+        return ThreadVectorEnv(env_fns)

@@ -14,6 +14,9 @@ CONTROL_PERIOD_S = 0.035
 FPS = 29
 """Control rate as LeRobot stores it, in whole Hz; the exact rate is 1 / 0.035 s = 28.57 Hz."""
 
+CAMERA_SIZE = 96
+"""Side of the observed pictures, in pixels."""
+
 ACTION_LIMIT_M = 0.05
 """Largest change of the desired position per step and axis; actions beyond are clipped."""
 

@@ -5,6 +5,7 @@ import importlib
 import os
 import platform
 import weakref
+from functools import lru_cache
 
 import numpy as np
 
@@ -64,6 +65,12 @@ class OffscreenCamera:
         pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return np.ascontiguousarray(pixels[::-1])
+
+
+@lru_cache(maxsize=4)
+def shared_camera(model: "mujoco.MjModel", size: int) -> OffscreenCamera:
+    """The process's camera for observations of a scene, size × size pixels; it belongs to one thread."""
+    return OffscreenCamera(model, size, size)
 
 
 def _open_gl(width: int, height: int):

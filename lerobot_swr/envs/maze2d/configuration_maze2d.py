@@ -16,9 +16,10 @@ from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.dynamics import in_goal
-from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv, MazeAgents
+from lerobot_swr.envs.maze2d.env import CAMERA_SIZE, FPS, Maze2DVectorEnv, MazeAgents
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, Scenes, get_layout
 from lerobot_swr.envs.maze2d.scenes import scene_names
+from lerobot_swr.envs.observed import PICTURE_NAMES, picture_features
 from lerobot_swr.envs.task import StartRule
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
@@ -51,6 +52,12 @@ class Maze2DEnvConfig(TaskEnvConfig):
     # Whether an agent that hits a wall stays where it was instead of sliding along.
     sticky_walls: bool = False
 
+    # What is observed: "state" (numbers), "both" (numbers and a camera) or "pixels" (the camera, and as
+    # observation.state how far the agent has moved in the last step: its place is only seen).
+    obs_type: str = "state"
+    # Side of the camera's pictures, in pixels.
+    camera_size: int = CAMERA_SIZE
+
     # Side of the rendered picture, in pixels.
     render_size: int = 320
     render_mode: str = "rgb_array"
@@ -67,6 +74,7 @@ class Maze2DEnvConfig(TaskEnvConfig):
             ACTION: ACTION,
             "agent_pos": OBS_STATE,
             "environment_state": OBS_ENV_STATE,
+            **PICTURE_NAMES,
         }
     )
 
@@ -78,7 +86,12 @@ class Maze2DEnvConfig(TaskEnvConfig):
             ValueError: Naming the offending key and value.
         """
         layout = MazeAgents(**self._maze_options).layout
-        self.features["environment_state"] = PolicyFeature(FeatureType.ENV, (len(scene_names(layout)),))
+        if self.obs_type == "pixels":
+            self.features.pop("environment_state", None)
+        else:
+            scene = PolicyFeature(FeatureType.ENV, (len(scene_names(layout)),))
+            self.features["environment_state"] = scene
+        self.features |= picture_features(self.obs_type, self.camera_size, self.camera_size)
         if self.episode_length < 1:
             raise ValueError(f"episode_length={self.episode_length}: expected at least 1 step")
 
@@ -90,6 +103,8 @@ class Maze2DEnvConfig(TaskEnvConfig):
             "start_radius": self.start_radius,
             "transition_noise": self.transition_noise,
             "sticky_walls": self.sticky_walls,
+            "obs_type": self.obs_type,
+            "camera_size": self.camera_size,
         }
 
     @property

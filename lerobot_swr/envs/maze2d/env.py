@@ -9,13 +9,16 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from PIL import Image
 
+from lerobot_swr.envs.maze2d.camera import MazeCamera
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal, move
 from lerobot_swr.envs.maze2d.layouts import get_layout
 from lerobot_swr.envs.maze2d.rendering import draw_episode, draw_maze
 from lerobot_swr.envs.maze2d.scenes import draw_scene, draw_start, maze_of, scene_names
+from lerobot_swr.envs.observed import check_obs_type, observation_space, observed
 
 STARTS = ("fixed", "pseudo_random", "random")
 FPS = 20
+CAMERA_SIZE = 64
 INSTRUCTION = "Walk through the maze to the goal."
 
 
@@ -26,8 +29,16 @@ class MazeAgents:
     """
 
     def __init__(
-        self, task: str, start: str, start_radius: float, transition_noise: float, sticky_walls: bool
+        self,
+        task: str,
+        start: str,
+        start_radius: float,
+        transition_noise: float,
+        sticky_walls: bool,
+        obs_type: str = "state",
+        camera_size: int = CAMERA_SIZE,
     ):
+        check_obs_type(obs_type)
         if start not in STARTS:
             raise ValueError(f"start={start!r}: expected one of {', '.join(STARTS)}")
         if not 0 <= start_radius <= 1:
@@ -37,6 +48,7 @@ class MazeAgents:
         self.layout = get_layout(task)
         self.start, self.start_radius = start, start_radius
         self.transition_noise, self.sticky_walls = transition_noise, sticky_walls
+        self.obs_type, self.camera = obs_type, MazeCamera(self.layout, camera_size)
 
     def begin(
         self, rng: np.random.Generator, options: dict[str, Any] | None
@@ -85,18 +97,30 @@ class MazeAgents:
         positions = move(positions, displacements, mazes, self.sticky_walls)
         return positions, in_goal(positions, mazes)
 
-    @staticmethod
-    def observe(positions: np.ndarray, scenes: np.ndarray) -> dict[str, np.ndarray]:
-        """Observations of (n, 2) positions in (n, S) scenes, float32."""
-        return {
+    def observe(
+        self, positions: np.ndarray, scenes: np.ndarray, before: np.ndarray | None = None
+    ) -> dict[str, Any]:
+        """Observations of (n, 2) positions in (n, S) scenes, numbers as float32.
+
+        Args:
+            positions: Where the agents are.
+            scenes: Their scenes.
+            before: (n, 2) where they were one step ago; None at the start.
+        """
+        numbers = {
             "agent_pos": positions.astype(np.float32),
             "environment_state": scenes.astype(np.float32),
         }
+        if self.obs_type == "state":
+            return numbers
+        last = numbers["agent_pos"] if before is None else before.astype(np.float32)
+        return observed(self.obs_type, numbers, last, self.camera.pictures(positions, scenes))
 
     def observation_space(self) -> spaces.Dict:
         """Space of one agent's observation."""
         sizes = {"agent_pos": 2, "environment_state": len(scene_names(self.layout))}
-        return spaces.Dict({key: spaces.Box(0.0, 1.0, (size,), np.float32) for key, size in sizes.items()})
+        numbers = {key: spaces.Box(0.0, 1.0, (size,), np.float32) for key, size in sizes.items()}
+        return observation_space(self.obs_type, numbers, (self.camera.size, self.camera.size))
 
     @staticmethod
     def action_space() -> spaces.Box:
@@ -125,6 +149,9 @@ class Maze2DEnv(gym.Env):
     (`lerobot_swr.envs.maze2d.layouts.Scenes`: the ranges); `fixed` is then the start that was drawn. Goal and
     doors are given by `reset(options={"environment_state": [...]})`, as they are observed.
 
+    **Pictures**: with `obs_type` `both` also `pixels`, of one camera above the maze, (camera_size,
+    camera_size, 3) uint8; with `pixels` no position is told but by the picture (`lerobot_swr.envs.observed`).
+
     **Reward**: 1 when the goal is reached, else 0. **Termination**: goal reached. **Truncation**: by the
     registered step limit (200).
 
@@ -143,11 +170,13 @@ class Maze2DEnv(gym.Env):
         transition_noise: Standard deviation of Gaussian noise on every displacement, in units of the largest
             step.
         sticky_walls: An agent that hits a wall or the border does not move in that step.
+        obs_type: `state`, `pixels` or `both`.
+        camera_size: Side of the observed pictures, in pixels.
         render_size: Side of the rendered picture, in pixels.
         render_mode: `rgb_array` or None.
 
     Raises:
-        ValueError: For an unknown layout or start, or a radius or noise out of range.
+        ValueError: For an unknown layout, start or kind of observation, or a number out of range.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
@@ -159,10 +188,14 @@ class Maze2DEnv(gym.Env):
         start_radius: float = 0.10,
         transition_noise: float = 0.0,
         sticky_walls: bool = False,
+        obs_type: str = "state",
+        camera_size: int = CAMERA_SIZE,
         render_size: int = 320,
         render_mode: str | None = None,
     ):
-        self.agents = MazeAgents(task, start, start_radius, transition_noise, sticky_walls)
+        self.agents = MazeAgents(
+            task, start, start_radius, transition_noise, sticky_walls, obs_type, camera_size
+        )
         self.task, self.task_description = task, INSTRUCTION
         self.observation_space = self.agents.observation_space()
         self.action_space = self.agents.action_space()
@@ -174,14 +207,14 @@ class Maze2DEnv(gym.Env):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode; the class says what the arguments do."""
         super().reset(seed=seed)
         start, self._scene = self.agents.begin(self.np_random, options)
         self._path, self._maze_picture = [start], None
         return self._observe(), {"is_success": False}
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply a (2,) action."""
         positions, reached = self.agents.step(
             self._path[-1][None], np.asarray(action)[None], [self.np_random], self._scene[None]
@@ -198,9 +231,9 @@ class Maze2DEnv(gym.Env):
             self._maze_picture = draw_maze(maze_of(self.agents.layout, self._scene), self._render_size)
         return draw_episode(self._maze_picture, np.stack(self._path))
 
-    def _observe(self) -> dict[str, np.ndarray]:
-        observed = self.agents.observe(self._path[-1][None], self._scene[None])
-        return {key: value[0] for key, value in observed.items()}
+    def _observe(self) -> dict[str, Any]:
+        found = self.agents.observe(self._path[-1][None], self._scene[None], self._path[-2:][0][None])
+        return _first(found)
 
 
 class Maze2DVectorEnv(gym.vector.VectorEnv):
@@ -210,6 +243,8 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         num_envs: Number of agents.
         max_episode_steps: Step limit.
         **maze_options: Those of `Maze2DEnv`, without `render_size` and `render_mode`.
+
+    Observations hold their own arrays: what a step returned is not changed by the next one.
     """
 
     metadata = {"render_fps": FPS, "autoreset_mode": AutoresetMode.DISABLED}  # noqa: RUF012
@@ -226,6 +261,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._rngs = [np.random.default_rng() for _ in range(num_envs)]
         self._positions: np.ndarray = np.zeros((num_envs, 2))
+        self._before: np.ndarray = np.zeros((num_envs, 2))
         self._scenes: np.ndarray = np.zeros((num_envs, len(scene_names(self.agents.layout))))
         self._terminated = np.zeros(num_envs, dtype=bool)
         self._steps = np.zeros(num_envs, dtype=int)
@@ -246,9 +282,11 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
             ]
         for i in np.flatnonzero(chosen):
             self._positions[i], self._scenes[i] = self.agents.begin(self._rngs[i], options)
+        self._before = np.where(chosen[:, None], self._positions, self._before)
         self._terminated[chosen] = False
         self._steps[chosen] = 0
-        return self.agents.observe(self._positions, self._scenes), {"is_success": self._terminated.copy()}
+        observations = self.agents.observe(self._positions, self._scenes, self._before)
+        return observations, {"is_success": self._terminated.copy()}
 
     def step(
         self, actions: np.ndarray
@@ -256,6 +294,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         """Apply (n, 2) actions to the agents that are still under way."""
         moved, reached = self.agents.step(self._positions, actions, self._rngs, self._scenes)
         under_way = ~self._terminated
+        self._before = np.where(under_way[:, None], self._positions, self._before)
         self._positions = np.where(under_way[:, None], moved, self._positions)
         reward = (reached & under_way).astype(np.float64)
         self._terminated = self._terminated | (reached & under_way)
@@ -263,7 +302,7 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
         truncated = (self._steps >= self._max_episode_steps) & ~self._terminated
         info = {"is_success": self._terminated.copy()}
         return (
-            self.agents.observe(self._positions, self._scenes),
+            self.agents.observe(self._positions, self._scenes, self._before),
             reward,
             self._terminated.copy(),
             truncated,
@@ -278,6 +317,11 @@ class Maze2DVectorEnv(gym.vector.VectorEnv):
     def get_attr(self, name: str) -> tuple[Any, ...]:
         """The attribute `name`, once per agent."""
         return self.call(name)
+
+
+def _first(batch: dict[str, Any]) -> dict[str, Any]:
+    """The first of a batch of observations."""
+    return {key: _first(value) if isinstance(value, dict) else value[0] for key, value in batch.items()}
 
 
 def _in_maze(key: str, given: Any, meanings: tuple[str, ...]) -> np.ndarray:
