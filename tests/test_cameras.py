@@ -1,14 +1,17 @@
 """What environments show of their state (``obs_type``), and datasets with pictures."""
 
+import json
 import time
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from conftest import train_flags
 from gymnasium.utils.env_checker import check_env
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.envs import make_env, preprocess_observation
 from lerobot.envs.utils import env_to_policy_features
+from lerobot.scripts import lerobot_eval
 
 from lerobot_swr.cli import dataset as dataset_command
 from lerobot_swr.demos.catalog import get_recipe
@@ -208,6 +211,36 @@ def test_the_command_adds_pictures(run_command, tmp_path, capsys):
             run_command(dataset_command.main, *flags, f"--root={tmp_path / 'b'}", *more)
         assert message in capsys.readouterr().err
     assert not (tmp_path / "b").exists()
+
+
+@pytest.mark.parametrize("obs_type", ["both", "pixels"])
+def test_lerobots_act_trains_on_pictures_and_acts_in_the_environment(
+    lerobot_train_command, run_command, camera_datasets, tmp_path, obs_type
+):
+    """``lerobot-train`` and ``lerobot-eval`` as they are, with a tiny network."""
+    sizes = {"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "chunk_size": 4}
+    network = {**sizes, "n_decoder_layers": 1, "n_action_steps": 4, "use_vae": "false"}
+    lerobot_train_command(
+        *train_flags("act", camera_datasets / obs_type, tmp_path / "run", 2),
+        "--policy.pretrained_backbone_weights=null",
+        *(f"--policy.{key}={value}" for key, value in network.items()),
+        "--save_freq=2",
+    )
+    run_command(
+        lerobot_eval.main,
+        f"--policy.path={tmp_path / 'run/checkpoints/last/pretrained_model'}",
+        "--policy.device=cpu",
+        "--env.type=maze2d",
+        "--env.task=small",
+        f"--env.obs_type={obs_type}",
+        "--env.episode_length=6",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        "--eval.use_async_envs=false",
+        f"--output_dir={tmp_path / 'eval'}",
+    )
+    overall = json.loads((tmp_path / "eval" / "eval_info.json").read_text())["overall"]
+    assert overall["n_episodes"] == 2
 
 
 @pytest.mark.parametrize("options", [{"obs_type": "depth"}, {"camera_size": 8}])

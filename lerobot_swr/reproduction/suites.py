@@ -212,7 +212,8 @@ def _scenes(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[C
         for options in variants:
             trained = training(settings, demos, policy, options)
             for kind, condition in SCENE_CONDITIONS.items():
-                yield evaluation(settings, demos, trained, condition, protocols=("stratified",), scenes=kind)
+                protocols = ("stratified", "scene") if kind == "new" else ("stratified",)
+                yield evaluation(settings, demos, trained, condition, protocols=protocols, scenes=kind)
 
 
 def _figures(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[Cell]:
