@@ -182,7 +182,7 @@ class Maze2DEnvConfig(TaskEnvConfig):
             edges.append(1.0)
             for left, right in zip(edges[::2], edges[1::2], strict=True):
                 axes.plot([left, right], [wall.y, wall.y], color="0.15", linewidth=3, solid_capstyle="butt")
-        goal = Circle(tuple(layout.goal), layout.goal_radius, fill=False, color="tab:green", linewidth=2)
+        goal = Circle(layout.goal, layout.goal_radius, fill=False, color="tab:green", linewidth=2)
         axes.add_patch(goal)
 
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:
@@ -198,6 +198,6 @@ def _draw_ranges(axes: Axes, layout: MazeLayout, scenes: Scenes) -> None:
             reach = scenes.door_shift + door.half_width
             axes.plot([door.x - reach, door.x + reach], [wall.y, wall.y], color="white", linewidth=3)
             axes.plot([door.x - reach, door.x + reach], [wall.y, wall.y], ":", color="0.15", linewidth=1)
-            axes.text(float(door.x), wall.y, str(door.checkpoint), color="0.4", ha="center", va="center")
+            axes.text(door.x, wall.y, str(door.checkpoint), color="0.4", ha="center", va="center")
     for ((left, right), (bottom, top)), colour in ((scenes.start, "tab:blue"), (scenes.goal, "tab:green")):
         axes.add_patch(Rectangle((left, bottom), right - left, top - bottom, color=colour, alpha=0.15))

@@ -11,12 +11,12 @@ class Door:
 
     Attributes:
         checkpoint: The number that names the door in a behaviour label; one digit, 0 is the goal.
-        x: Centre of the gap, as a share of the maze's side; (n,) for n mazes at once.
+        x: Centre of the gap, as a share of the maze's side; an array (n,) where this stands for n mazes.
         half_width: Half the width of the gap, in the same unit.
     """
 
     checkpoint: int
-    x: float | np.ndarray
+    x: float
     half_width: float
 
 
@@ -50,14 +50,14 @@ class MazeLayout:
     Attributes:
         walls: From the start (bottom) to the goal (top).
         start: (2,) start position.
-        goal: (2,) centre of the goal disc; (n, 2) for n mazes at once.
+        goal: (2,) centre of the goal disc; (n, 2) where this stands for n mazes.
         goal_radius: The goal is reached at this distance from its centre or nearer.
         scenes: Where start, goal and doors differ from episode to episode; None where all are the same.
     """
 
     walls: tuple[Wall, ...]
     start: tuple[float, float] = (0.5, 0.08)
-    goal: tuple[float, float] | np.ndarray = (0.5, 0.92)
+    goal: tuple[float, float] = (0.5, 0.92)
     goal_radius: float = 0.05
     scenes: Scenes | None = None
 

@@ -26,13 +26,12 @@ def draw_maze(layout: MazeLayout, size: int) -> Image.Image:
     draw.rectangle((0, 0, size - 1, size - 1), outline=WALL, width=width)
     for wall in layout.walls:
         left = 0.0
-        for door in sorted(wall.doors, key=lambda door: float(door.x)):
-            centre = float(door.x)
+        for door in sorted(wall.doors, key=lambda door: door.x):
             draw.line(
-                (*pixel(left, wall.y), *pixel(centre - door.half_width, wall.y)), fill=WALL, width=width
+                (*pixel(left, wall.y), *pixel(door.x - door.half_width, wall.y)), fill=WALL, width=width
             )
-            draw.text(pixel(centre, wall.y), str(door.checkpoint), fill=DOOR, font=font, anchor="mm")
-            left = centre + door.half_width
+            draw.text(pixel(door.x, wall.y), str(door.checkpoint), fill=DOOR, font=font, anchor="mm")
+            left = door.x + door.half_width
         draw.line((*pixel(left, wall.y), *pixel(1.0, wall.y)), fill=WALL, width=width)
 
     (gx, gy), r = pixel(*layout.goal), layout.goal_radius * (size - 1)

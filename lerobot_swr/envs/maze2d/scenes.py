@@ -45,7 +45,7 @@ def maze_of(layout: MazeLayout, scene: np.ndarray) -> MazeLayout:
     scene = np.asarray(scene, dtype=np.float64)
     doors = iter(np.moveaxis(scene[..., 2:], -1, 0))
     walls = tuple(
-        replace(wall, doors=tuple(replace(door, x=next(doors)) for door in wall.doors))
+        replace(wall, doors=tuple(replace(door, x=next(doors)) for door in wall.doors))  # type: ignore[arg-type]
         for wall in layout.walls
     )
-    return replace(layout, walls=walls, goal=scene[..., :2])
+    return replace(layout, walls=walls, goal=scene[..., :2])  # type: ignore[arg-type]
