@@ -82,7 +82,8 @@ def observation_space(
     if obs_type == "state":
         return spaces.Dict(dict(numbers))
     place = numbers["agent_pos"]
-    moved = spaces.Box(place.low - place.high, place.high - place.low, dtype=np.float32)
+    reach = (place.high - place.low).astype(np.float32)
+    moved = spaces.Box(-reach, reach, dtype=np.float32)
     picture = spaces.Box(0, 255, (*picture_size, 3), np.uint8)
     shown = _shown(obs_type, numbers, moved, picture)
     return spaces.Dict({**shown, "pixels": spaces.Dict(shown["pixels"])})

@@ -74,7 +74,7 @@ def draw_empty_maze(maze: MazeLayout, size: int) -> np.ndarray:
     paint((maze.goal_radius - np.hypot(x - goal_x, y - goal_y)) * size + 0.5, _GOAL)
     for wall in maze.walls:
         across = np.clip((WALL_HALF_WIDTH - np.abs(y - wall.y)) * size + 0.5, 0, 1)
-        along = np.ones(size)
+        along: np.ndarray = np.ones(size)
         for door in wall.doors:
             along = np.minimum(along, np.clip((np.abs(x - door.x) - door.half_width) * size + 0.5, 0, 1))
         paint(across * along, _WALL)
