@@ -12,10 +12,11 @@ Reading order, along the way data takes:
 * `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports.
 * `lerobot_swr.cli`: the ``lerobot-swr-*`` commands.
 
-Importing this package registers the environment, policy and optimizer configurations with LeRobot.
+Importing this package registers the environment, policy and optimizer configurations with LeRobot, and
+shortens one of its log messages (`lerobot_swr.ffmpeg`).
 """
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 import lerobot_swr.envs.d3il.configuration_d3il
 import lerobot_swr.envs.maze2d.configuration_maze2d
@@ -23,3 +24,6 @@ import lerobot_swr.envs.pusht.task
 import lerobot_swr.policies.baselines.configuration_baselines
 import lerobot_swr.policies.configuration_swr
 import lerobot_swr.policies.processor_swr  # noqa: F401
+from lerobot_swr.ffmpeg import shorten_message
+
+shorten_message()

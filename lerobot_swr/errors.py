@@ -8,9 +8,12 @@ from lerobot.datasets.utils import CompatibilityError
 from safetensors import SafetensorError
 from yaml import YAMLError
 
+from lerobot_swr.installation import MissingExtraError
+
 USER_ERRORS = (
     *(ValueError, OSError, ParsingError, YAMLError),
     *(SafetensorError, CompatibilityError, DatasetGenerationError, NotImplementedError),
+    MissingExtraError,
 )
 FULL_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 LONGEST = 1500  # characters

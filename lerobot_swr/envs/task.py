@@ -10,15 +10,17 @@ An adapter is a small class, registered for the type of another package's config
 
 from collections.abc import Callable, Mapping
 from functools import singledispatch
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from lerobot.envs import EnvConfig, make_env
 from lerobot.utils.constants import OBS_STATE
-from matplotlib.axes import Axes
 
 from lerobot_swr.behaviors import BehaviorRule
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # half a second, for pictures alone
 
 StartRule = Callable[[Mapping[str, np.ndarray]], dict[str, Any]]
 """Maps an episode's observations to the options of `reset` that put the environment into its first state."""
@@ -94,7 +96,7 @@ class Task:
         """Ways of making the task harder, for robustness evaluations: name to the options that it sets."""
         return {}
 
-    def draw_scene(self, axes: Axes) -> None:
+    def draw_scene(self, axes: "Axes") -> None:
         """Draw what does not move (walls, obstacles) behind the paths; by default nothing."""
 
     def create_rollout_env(self, n_envs: int) -> gym.vector.VectorEnv:

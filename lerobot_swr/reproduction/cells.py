@@ -4,25 +4,22 @@ A finished cell is one JSON file. Its name carries a hash of all that defines th
 settings is another cell, and a file that is there is never computed again.
 """
 
-import contextlib
 import fcntl
 import hashlib
 import json
 import os
-import platform
 import socket
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from lerobot_swr.installation import installed_versions
 from lerobot_swr.whole_files import write_whole
 
 FORMAT = 2  # of results; another one makes every cell a new one
-PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy", "mujoco", "diffusers")  # noted where installed
 
 
 @dataclass(frozen=True)
@@ -193,12 +190,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [_plain(one) for one in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
-
-
-def installed_versions() -> dict[str, str]:
-    """Of Python and of those of `PACKAGES` that are installed."""
-    versions = {"python": platform.python_version()}
-    for name in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
-            versions[name] = version(name)
-    return versions

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from lerobot.utils.constants import OBS_STATE
-from plotly.offline import get_plotlyjs
 
+from lerobot_swr.installation import MissingExtraError
 from lerobot_swr.styles.filters import column_kind
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import Trajectories
@@ -69,6 +69,14 @@ def as_script(data: Any) -> str:
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
+def _plotly_js() -> str:
+    try:
+        from plotly.offline import get_plotlyjs
+    except ModuleNotFoundError as error:
+        raise MissingExtraError("the interactive map", "map", error) from error
+    return get_plotlyjs()
+
+
 def write_style_map(
     path: Path,
     styles: np.ndarray,
@@ -106,6 +114,6 @@ def write_style_map(
     }
     page = files("lerobot_swr.styles").joinpath("map.html").read_text(encoding="utf-8")
     before, after = page.split("/*DATA*/")
-    page = before.replace("/*PLOTLY*/", get_plotlyjs()) + as_script(data) + after
+    page = before.replace("/*PLOTLY*/", _plotly_js()) + as_script(data) + after
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, page)

@@ -6,7 +6,7 @@ Importing this module needs neither MuJoCo nor numba; making an environment does
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
@@ -15,8 +15,6 @@ from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
-from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Rectangle
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.configuration import tells_bad_values
@@ -37,6 +35,9 @@ from lerobot_swr.envs.d3il.recorded_starts import aligning_start, avoiding_start
 from lerobot_swr.envs.observed import PICTURE_NAMES, check_obs_type, picture_features, shows_pictures
 from lerobot_swr.envs.task import StartRule
 from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # half a second, for pictures alone
 
 GYM_IDS = {"avoiding": "lerobot_swr/D3IL-Avoiding-v0", "aligning": "lerobot_swr/D3IL-Aligning-v0"}
 EPISODE_LENGTHS = {"avoiding": AVOIDING_EPISODE_LENGTH, "aligning": ALIGNING_EPISODE_LENGTH}
@@ -185,8 +186,10 @@ class D3ILEnvConfig(TaskEnvConfig):
             return observations[OBS_STATE][:, [3, 2]]
         return observations[OBS_ENV_STATE][:, [1, 0]]
 
-    def draw_scene(self, axes: Axes) -> None:
+    def draw_scene(self, axes: "Axes") -> None:
         """Obstacles and finish line, or the areas where box and target start; the robot is at the top."""
+        from matplotlib.patches import Circle, Rectangle
+
         if self.task == "avoiding":
             for obstacle in OBSTACLES:
                 axes.add_patch(Circle((obstacle.y, obstacle.x), obstacle.radius, color="tab:red"))

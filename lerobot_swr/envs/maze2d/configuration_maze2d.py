@@ -2,15 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
-from matplotlib.axes import Axes
-from matplotlib.patches import Circle, Rectangle
 
 from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
@@ -21,6 +19,9 @@ from lerobot_swr.envs.maze2d.layouts import MazeLayout, Scenes, get_layout
 from lerobot_swr.envs.maze2d.scenes import scene_names
 from lerobot_swr.envs.observed import PICTURE_NAMES, picture_features
 from lerobot_swr.envs.task import StartRule
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # half a second, for pictures alone
 
 GYM_ID = "lerobot_swr/Maze2D-v0"
 
@@ -165,8 +166,10 @@ class Maze2DEnvConfig(TaskEnvConfig):
             "sticky, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
         }
 
-    def draw_scene(self, axes: Axes) -> None:
+    def draw_scene(self, axes: "Axes") -> None:
         """Walls, door numbers and the goal; where scenes differ, all that they have in common."""
+        from matplotlib.patches import Circle
+
         layout = get_layout(self.task or "")
         axes.set(xlim=(0, 1), ylim=(0, 1))
         if layout.scenes is not None:
@@ -190,8 +193,10 @@ class Maze2DEnvConfig(TaskEnvConfig):
         return Maze2DVectorEnv(n_envs, max_episode_steps=self.episode_length, **self._maze_options)
 
 
-def _draw_ranges(axes: Axes, layout: MazeLayout, scenes: Scenes) -> None:
+def _draw_ranges(axes: "Axes", layout: MazeLayout, scenes: Scenes) -> None:
     """Walls, dotted where doors may be, and the areas of start and goal."""
+    from matplotlib.patches import Rectangle
+
     for wall in layout.walls:
         axes.axhline(wall.y, color="0.15", linewidth=3)
         for door in wall.doors:

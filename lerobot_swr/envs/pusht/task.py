@@ -1,15 +1,18 @@
 """What evaluations ask of LeRobot's own environment type ``pusht``."""
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
-from matplotlib.axes import Axes
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.pusht.block import GOAL_POSE, OUTLINE, keypoints_of, reset_state
 from lerobot_swr.envs.task import StartRule, Task, task_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes  # half a second, for pictures alone
 
 KEYPOINT_OBSERVATIONS = "environment_state_agent_pos"
 
@@ -51,7 +54,7 @@ class PushTTask(Task):
         """(T, 2) path of the middle of the block's keypoints, in pixels."""
         return observations[OBS_ENV_STATE].reshape(-1, 8, 2).mean(axis=1)
 
-    def draw_scene(self, axes: Axes) -> None:
+    def draw_scene(self, axes: "Axes") -> None:
         """The goal, in the field as the environment renders it (y downwards)."""
         axes.fill(*keypoints_of(GOAL_POSE)[list(OUTLINE)].T, color="lightgreen")
         axes.set(xlim=(0, 512), ylim=(512, 0))
