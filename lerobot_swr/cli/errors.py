@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 
 from lerobot_swr.errors import INTERRUPTED, USER_ERRORS, one_line
+from lerobot_swr.progress import quieten_others
 
 
 def explain_errors(command: Callable[[], None]) -> Callable[[], None]:
@@ -16,6 +17,7 @@ def explain_errors(command: Callable[[], None]) -> Callable[[], None]:
 
     @functools.wraps(command)
     def wrapper() -> None:
+        quieten_others()
         try:
             command()
         except (*USER_ERRORS, KeyboardInterrupt) as error:

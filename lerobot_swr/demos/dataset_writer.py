@@ -12,10 +12,10 @@ import numpy as np
 from datasets import disable_progress_bars
 from lerobot.datasets import LeRobotDataset
 from lerobot.utils.constants import ACTION
-from tqdm import tqdm
 
 from lerobot_swr.demos.columns import check_columns, feature_columns, frame_columns
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
+from lerobot_swr.progress import Progress
 
 
 def write_dataset(
@@ -70,7 +70,7 @@ def write_dataset(
         )
         disable_progress_bars()  # those of `datasets`, one per episode
         try:
-            for demonstration in tqdm(
+            for demonstration in Progress(
                 _demonstrations(recipe, seed, work_dir),
                 total=recipe.n_episodes,
                 desc=recipe.name,

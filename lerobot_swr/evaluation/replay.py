@@ -9,7 +9,6 @@ import numpy as np
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import ACTION
-from tqdm import tqdm
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
@@ -26,6 +25,7 @@ from lerobot_swr.evaluation.time_offsets import (
     describe,
     deviations,
 )
+from lerobot_swr.progress import Progress
 from lerobot_swr.trajectories import dimension_names
 
 
@@ -94,7 +94,7 @@ def run_replay(
     chosen = list(range(len(trajectories)) if episodes is None else episodes)
     recorded = [trajectories.episode(i) for i in chosen]
     replays: list[Replay] = []
-    with tqdm(total=sum(len(one[ACTION]) for one in recorded), desc="replay", unit="step") as progress:
+    with Progress(total=sum(len(one[ACTION]) for one in recorded), desc="replay", unit="step") as progress:
         while len(replays) < len(recorded):
             batch = recorded[len(replays) : len(replays) + batch_size]
             env = task.create_rollout_env(len(batch))

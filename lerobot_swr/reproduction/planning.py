@@ -5,8 +5,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 
-from tqdm import tqdm
-
+from lerobot_swr.progress import Progress
 from lerobot_swr.reproduction.baselines import BASELINES
 from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.training import STACKED, checkpoint_folder, steps_done
@@ -81,7 +80,7 @@ def is_finished(cell: Cell, store: Store) -> bool:
 def progress(cells: Sequence[Cell], store: Store) -> Iterator[None]:
     """A bar over the cells, fed from what they have written, whoever computes them."""
     finished = threading.Event()
-    with tqdm(total=len(cells), desc="Cells", unit="cell", file=sys.stdout) as bar:
+    with Progress(total=len(cells), desc="Cells", unit="cell", file=sys.stdout) as bar:
 
         def watch() -> None:
             while True:

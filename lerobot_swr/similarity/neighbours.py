@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from tqdm import tqdm
 
+from lerobot_swr.progress import Progress
 from lerobot_swr.similarity.sketch import Sketch
 from lerobot_swr.similarity.vectors import EpisodeVectors
 
@@ -53,7 +53,9 @@ def survey(
     search = _Search(vectors, sketch, rows, candidates, k)
     size = max(workers, BLOCK_NUMBERS // len(candidates))
     with ThreadPoolExecutor(workers) as pool, torch.no_grad():
-        for start in tqdm(range(0, len(rows), size), "Comparing demonstrations", disable=len(rows) <= size):
+        for start in Progress(
+            range(0, len(rows), size), "Comparing demonstrations", disable=len(rows) <= size
+        ):
             stop = min(start + size, len(rows))
             lower = search.lower_bounds(start, stop)
             edges = np.linspace(0, len(lower), workers + 1).astype(int)

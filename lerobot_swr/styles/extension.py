@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.progress import Progress
 from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames
@@ -105,7 +105,7 @@ def add_demonstrations(
     starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
     encoded, errors, nearest_errors, began = [], [], [], []
     parts = [slice(i, i + CHUNK) for i in range(0, len(chosen), CHUNK)]
-    with tqdm(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
+    with Progress(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
         for part in parts:
             frames = [read(episode) for episode in chosen[part]]
             found = policy.encode(frames, starts[part], ENCODING_STEPS, bar.update)

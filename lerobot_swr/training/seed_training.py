@@ -17,8 +17,8 @@ from lerobot.datasets.factory import make_train_eval_datasets
 from lerobot.utils.constants import ACTION
 from lerobot.utils.utils import init_logging
 from torch import Tensor
-from tqdm import tqdm
 
+from lerobot_swr.progress import Progress
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.frame_order import FrameOrder
 from lerobot_swr.training.memory import keep_freed_memory, large_pages
@@ -79,7 +79,7 @@ def _train_in_processes(config: SeedsTrainConfig, groups: list[list[int]], steps
         for i, seeds in enumerate(groups)
     ]
     total = sum(config.steps - steps[seed] for seeds in groups for seed in seeds)
-    with tqdm(total=total, desc="Training", unit="seed-step") as bar, large_pages():
+    with Progress(total=total, desc="Training", unit="seed-step") as bar, large_pages():
         run_processes(processes, config.jobs or 1, lambda: bar.update(sum(done) - bar.n))
 
 
@@ -114,7 +114,7 @@ def _train_group(config: SeedsTrainConfig, seeds: list[int], count: Callable[[],
     orders = [FrameOrder(starts, ends, dataset.episodes, seed, config.batch_size, places) for seed in seeds]
     frames = _prepared_frames(runs, dataset)
     window: list[Tensor] = []
-    with tqdm(
+    with Progress(
         total=config.steps * len(seeds),
         initial=runs.step * len(seeds),
         desc="Training",
