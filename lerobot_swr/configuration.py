@@ -10,6 +10,7 @@ from typing import Any
 
 from huggingface_hub import constants
 
+from lerobot_swr.checkpoint_files import check_files
 from lerobot_swr.dataset_checks import check_format
 from lerobot_swr.run_context import dataset_of_command
 
@@ -65,9 +66,13 @@ def check_checkpoint_path(path: str) -> None:
 
     Raises:
         FileNotFoundError: Naming the part of the path that exists, and what is in there.
+        ValueError: If a file of the folder is damaged.
     """
     folder = Path(path)
-    if folder.is_dir() or (re.fullmatch(r"[\w.-]+/[\w.-]+", path) and not folder.parent.is_dir()):
+    if folder.is_dir():
+        check_files(folder)
+        return
+    if re.fullmatch(r"[\w.-]+/[\w.-]+", path) and not folder.parent.is_dir():
         return
     exists = next(parent for parent in folder.absolute().parents if parent.is_dir())
     inside = sorted(child.name for child in exists.iterdir() if child.is_dir())

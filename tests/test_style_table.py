@@ -18,6 +18,7 @@ from lerobot_swr.demos.catalog import RECIPES
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
+from lerobot_swr.sharing.policy_card import PICTURE
 from lerobot_swr.similarity.distances import pairwise_distances
 from lerobot_swr.styles.selection import StyleSelection
 from lerobot_swr.styles.table import TABLE_FILE, StyleTable, load_style_table, make_style_table
@@ -99,19 +100,23 @@ def test_a_saved_table_comes_back_as_it_was(table, tmp_path):
         assert [path.name for path in tmp_path.iterdir()] == [TABLE_FILE]
 
 
-def test_the_table_is_pushed_to_the_hub_before_the_policy(checkpoint, monkeypatch):
-    """LeRobot uploads no parquet files, and a remote run ends when it says that the policy is there."""
+def test_table_and_picture_are_pushed_to_the_hub_before_the_policy(checkpoint, monkeypatch):
+    """LeRobot uploads neither, and a remote run ends when it says that the policy is there."""
     policy, pushed = reload(checkpoint), []
     policy.config.repo_id = "user/policy"
 
     def keep(api, path_or_fileobj, path_in_repo, repo_id):
-        pushed.append((repo_id, path_in_repo, path_or_fileobj.read_bytes()))
+        content = path_or_fileobj if isinstance(path_or_fileobj, bytes) else path_or_fileobj.read_bytes()
+        pushed.append((repo_id, path_in_repo, content))
 
     monkeypatch.setattr("huggingface_hub.HfApi.create_repo", lambda api, **_: None)
     monkeypatch.setattr("huggingface_hub.HfApi.upload_file", keep)
     monkeypatch.setattr(PreTrainedPolicy, "push_model_to_hub", lambda *_, **__: pushed.append("policy"))
     policy.push_model_to_hub(None)
-    assert pushed == [("user/policy", TABLE_FILE, (checkpoint / TABLE_FILE).read_bytes()), "policy"]
+    assert pushed == [
+        *(("user/policy", name, (checkpoint / name).read_bytes()) for name in (TABLE_FILE, PICTURE)),
+        "policy",
+    ]
 
 
 def test_missing_neighbours_are_nobodys(table):

@@ -6,6 +6,8 @@ from typing import Any, cast
 
 from huggingface_hub import ModelCard
 from huggingface_hub.constants import CONFIG_NAME
+from lerobot.configs.train import TrainPipelineConfig
+from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from safetensors import SafetensorError
 from safetensors.torch import load_file
@@ -13,13 +15,7 @@ from torch import Tensor
 
 from lerobot_swr.dataset_checks import check_dimensions
 from lerobot_swr.policies.state_config import StateConfig
-
-INSTALL_HINT = """
-## Install
-
-This policy is a LeRobot plugin: `pip install lerobot_policy_swr`, then use it with `lerobot-eval`,
-`lerobot-rollout` or `lerobot-train` as any LeRobot policy.
-"""
+from lerobot_swr.sharing.policy_card import TRAINING_KEYS, policy_card
 
 
 class CheckedLoading:
@@ -85,8 +81,15 @@ class CheckedLoading:
             "train a new policy on it",
         )
 
-    def generate_model_card(self, *args: Any, **kwargs: Any) -> ModelCard:
-        """LeRobot's model card, with a word on how to install the plugin."""
-        card = super().generate_model_card(*args, **kwargs)  # type: ignore[misc]
-        card.text += INSTALL_HINT
-        return card
+    def generate_model_card(
+        self,
+        dataset_repo_id: str | None = None,
+        model_type: str | None = None,
+        license: str | None = None,
+        tags: list[str] | None = None,
+        cfg: TrainPipelineConfig | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> ModelCard:
+        """The card of this package instead of LeRobot's; licence and tags are the configuration's."""
+        training = None if cfg is None else {key: getattr(cfg, key) for key in TRAINING_KEYS}
+        return policy_card(self, dataset=dataset_repo_id, training=training)

@@ -13,6 +13,7 @@ from lerobot_swr.policies.checked_loading import CheckedLoading
 from lerobot_swr.policies.configuration_swr import BCConfig, ZBCConfig
 from lerobot_swr.policies.lessons import Correct
 from lerobot_swr.policies.training_data import TrainingData
+from lerobot_swr.sharing.policy_card import upload_beside, write_policy_card
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.table import load_style_table
 
@@ -49,9 +50,8 @@ class StoredStyles(CheckedLoading):
         return policy
 
     def push_model_to_hub(self, cfg: TrainPipelineConfig, *args: Any, **kwargs: Any) -> None:
-        """As LeRobot does, and the table, whose kind of file LeRobot leaves out."""
-        if self.has_styles and self.styles.table is not None:
-            self.styles.table.upload(cast(str, self.config.repo_id), self.config.private)
+        """As LeRobot does, and table and picture of the styles, whose kinds of files LeRobot leaves out."""
+        upload_beside(self)
         # Last, because a remote run ends when it says that the model is there.
         super().push_model_to_hub(cfg, *args, **kwargs)
 
@@ -59,6 +59,7 @@ class StoredStyles(CheckedLoading):
         super()._save_pretrained(save_directory, state_dict)
         if self.has_styles and self.styles.table is not None:
             self.styles.table.save(Path(save_directory))
+        write_policy_card(self, Path(save_directory))
 
     def adapted(self, state: dict[str, Tensor]) -> dict[str, Tensor]:
         """What of a checkpoint's tensors is to be loaded: on another dataset, new styles are started.
