@@ -5,7 +5,6 @@ import json
 import time
 import traceback
 from collections.abc import Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from typing import Any
 import torch
 from joblib import Parallel, delayed
 
+from lerobot_swr.reproduction.backends import worker_deaths
 from lerobot_swr.reproduction.baselines import known_policies, missing_extras
 from lerobot_swr.reproduction.cells import Cell, Store, this_command
 from lerobot_swr.reproduction.demonstrations import Demonstrations, prepare
@@ -49,8 +49,8 @@ class Failure:
 def reproduce(settings: ReproductionSettings, command: str = "") -> list[Failure]:
     """Run the chosen suites: every cell that is not finished, and no other.
 
-    Runs under joblib's active backend, so ``with joblib.parallel_config(backend=...)`` sends the cells to a
-    cluster whose machines see the same output folder.
+    With ``jobs=None`` joblib's active backend is used: ``with joblib.parallel_config(...)`` sends the
+    cells to a cluster, Dask's or Ray's, whose machines see the same output folder.
 
     Args:
         settings: What to run.
@@ -122,7 +122,7 @@ def run_cells(
             )
             failures.update({failure.cell: failure for of_chain in outcomes for failure in of_chain})
             return []
-        except BrokenProcessPool:
+        except worker_deaths():
             known = [cell for chain in chosen for cell in chain if store.failure_path(cell).is_file()]
             failures.update({cell: _stored_failure(cell, store) for cell in known})
             under_way = [chain for chain in chosen if any(map(is_running, chain))]
