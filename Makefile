@@ -3,9 +3,10 @@ PYTHON ?= python3.12
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS_READY := $(VENV)/.docs_ready
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow lint bench
+.PHONY: help setup demo test slow lint bench docs notebooks wheel
 
 help:  ## Show the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 10
@@ -18,7 +19,7 @@ $(READY): pyproject.toml
 	$(BIN)/python -m pip install -e '.[dev]'
 	touch $@
 
-demo: $(READY)  ## Train BC, ZBC and WZBC on two mazes and write outputs/demo/report.html (10 minutes)
+demo: $(READY)  ## Train BC, ZBC, WZBC in two mazes and on an arm, write outputs/demo/report.html (10 minutes)
 	HF_HUB_OFFLINE=1 $(BIN)/lerobot-swr-demo --output_dir=outputs/demo
 
 test: $(READY)  ## Run the fast tests (minutes)
@@ -34,3 +35,20 @@ lint: $(READY)  ## Check style and types
 
 bench: $(READY)  ## Print the benchmarks
 	HF_HUB_OFFLINE=1 $(BIN)/python -m benchmarks
+
+docs: $(DOCS_READY)  ## Build the documentation into build/site; broken links, unlisted pages, missing docstrings fail
+	$(BIN)/ruff check --select D lerobot_swr
+	$(BIN)/python -m docs.site.notebooks
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+notebooks: $(DOCS_READY)  ## Run the tutorials' notebooks (minutes)
+	HF_HUB_OFFLINE=1 PATH="$(abspath $(BIN)):$$PATH" $(BIN)/python -m docs.site.notebooks --run
+
+$(DOCS_READY): $(READY)
+	$(BIN)/python -m pip install -e '.[docs]'
+	touch $@
+
+wheel: $(READY)  ## Build wheel and source distribution into dist/ and check them
+	rm -rf dist
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check --strict dist/*

@@ -1,5 +1,6 @@
 """What a reader opens exists, and what a user copies parses."""
 
+import json
 import re
 from pathlib import Path
 
@@ -8,11 +9,13 @@ import yaml
 from lerobot.configs.train import TrainPipelineConfig
 
 REPOSITORY = Path(__file__).parent.parent
-PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+DOCS = REPOSITORY / "docs"
+PAGES = [*sorted(REPOSITORY.glob("*.md")), *sorted(DOCS.rglob("*.md"))]
+TUTORIALS = ("maze", "so101")
 CONFIGS = sorted((REPOSITORY / "configs").glob("*.yaml"))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(REPOSITORY)))
 def test_links_pictures_and_scripts_of_a_page_exist(page):
     """Every relative link and every script to run is a file of the repository."""
     text = page.read_text()
@@ -21,6 +24,34 @@ def test_links_pictures_and_scripts_of_a_page_exist(page):
     scripts = re.findall(r"python ((?:docs|benchmarks)/\S+\.py)", text)
     missing += [script for script in scripts if not (REPOSITORY / script).is_file()]
     assert not missing
+
+
+def test_every_page_has_its_place_on_the_site():
+    """mkdocs.yml lists each page once; one that is not listed would fail `make docs`."""
+    listed = re.findall(
+        r"^ +- (?:[^:\n]+: )?(\S+\.md)$", (REPOSITORY / "mkdocs.yml").read_text(), re.MULTILINE
+    )
+    assert sorted(listed) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
+
+
+def test_every_module_is_in_the_reference():
+    """A new package or module of the first level is named on a page of docs/api."""
+    named = set(
+        re.findall(r"^::: lerobot_swr\.(\w+)$", "".join(p.read_text() for p in DOCS.glob("api/*.md")), re.M)
+    )
+    modules = {path.stem for path in (REPOSITORY / "lerobot_swr").iterdir() if not path.stem.startswith("_")}
+    assert named == modules - {"py"}
+
+
+def test_the_notebooks_are_the_tutorials():
+    """`python -m docs.site.notebooks` was run after the page was changed; the blocks are the cells."""
+    for tutorial in TUTORIALS:
+        notebook = json.loads((REPOSITORY / "notebooks" / f"{tutorial}.ipynb").read_text())
+        cells = ["".join(one["source"]) for one in notebook["cells"] if one["cell_type"] == "code"]
+        page = (DOCS / "tutorials" / f"{tutorial}.md").read_text()
+        blocks = re.findall(r"^```(python|bash)\n(.*?)\n```$", page, flags=re.DOTALL | re.MULTILINE)
+        assert cells == [f"%%bash\n{code}" if language == "bash" else code for language, code in blocks]
+        assert not any(one.get("outputs") for one in notebook["cells"])
 
 
 def test_the_readme_is_short():
