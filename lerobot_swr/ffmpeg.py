@@ -26,7 +26,7 @@ class _OneLine(logging.Filter):
         text = record.getMessage()
         if "torchcodec" not in text or "pyav" not in text or os.environ.get(DEBUG):
             return True
-        if os.environ.get(TOLD):
+        if os.environ.get(TOLD) or os.environ.get("LOCAL_RANK", "0") != "0":  # of torchrun's one says it
             return False
         os.environ[TOLD] = "1"
         if "\n" in text:
