@@ -61,8 +61,8 @@ class DemoCommand:
     datasets: list[str] | None = None
     # Training steps of each policy; these fit ten minutes on two cores.
     bc_steps: int = 20_000
-    zbc_steps: int = 40_000
-    wzbc_steps: int = 60_000
+    zbc_steps: int = 60_000
+    wzbc_steps: int = 80_000
     # Rollouts per evaluation.
     n_episodes: int = 100
     # Trainings that run at once.
