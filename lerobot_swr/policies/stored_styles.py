@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Self, cast
 
 from lerobot.configs.train import TrainPipelineConfig
-from torch import Tensor
+from torch import Tensor, nn
 
 from lerobot_swr.corrective.relative_actions import RelativeActions
 from lerobot_swr.policies import style_checkpoints
@@ -39,7 +39,7 @@ class StoredStyles(CheckedLoading):
         Raises:
             ValueError: If the checkpoint is damaged, or the selection of styles is empty.
         """
-        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)
+        policy = super().from_pretrained(pretrained_name_or_path, **kwargs)  # type: ignore[misc]
         if policy.has_styles:
             options = {key: kwargs[key] for key in HUB_OPTIONS if key in kwargs}
             style_checkpoints.adopt_table(
@@ -53,10 +53,10 @@ class StoredStyles(CheckedLoading):
         """As LeRobot does, and table and picture of the styles, whose kinds of files LeRobot leaves out."""
         upload_beside(self)
         # Last, because a remote run ends when it says that the model is there.
-        super().push_model_to_hub(cfg, *args, **kwargs)
+        super().push_model_to_hub(cfg, *args, **kwargs)  # type: ignore[misc]
 
     def _save_pretrained(self, save_directory: Path, state_dict: dict[str, Tensor] | None = None) -> None:
-        super()._save_pretrained(save_directory, state_dict)
+        super()._save_pretrained(save_directory, state_dict)  # type: ignore[misc]
         if self.has_styles and self.styles.table is not None:
             self.styles.table.save(Path(save_directory))
         write_policy_card(self, Path(save_directory))
@@ -69,7 +69,7 @@ class StoredStyles(CheckedLoading):
         """
         if self.correct is not None and self.data is None:
             style_checkpoints.check_corrective(cast(ZBCConfig, self.config).corrective, state)
-        state = style_checkpoints.with_own_draws(self, state, self.data)
+        state = style_checkpoints.with_own_draws(cast(nn.Module, self), state, self.data)
         if self.data is not None and self.relative is not None:  # computed from the dataset
             own = self.relative.state_dict().items()
             state = {**state, **{f"relative.{key}": value for key, value in own}}
