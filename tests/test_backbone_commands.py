@@ -1,9 +1,7 @@
 """Commands of LeRobot and of this package with styles over LeRobot's policies."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
 from styled_policies import LENGTHS, TINY, batch_of, metadata_of
-from training_command import assert_same_checkpoint, forget_after
+from training_command import assert_same_checkpoint, forget_after, train_in_two_processes
 
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.cli import styles as styles_command
@@ -239,14 +237,5 @@ def test_offline_evaluation_sees_what_training_saw(make_styled, camera_arcs, tmp
 def test_two_processes_train_one_policy(small_maze, tmp_path):
     """It runs to its end, and the checkpoint has every style."""
     flags = train_flags("zbc", small_maze, tmp_path / "run", 2, *nested("act"))
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [*launch, str(Path(sys.executable).with_name("lerobot-train")), *flags],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=600,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
+    assert "Effective batch size: 8 x 2 = 16" in train_in_two_processes(flags, tmp_path / "log")
     assert load(checkpoint(tmp_path / "run")).styles.trained.tolist() == [1] * 6

@@ -1,13 +1,7 @@
 """LeRobot's own training command with this plugin: resume, subsets, several processes, refusals."""
 
-import contextlib
-import os
 import re
 import shutil
-import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -16,7 +10,7 @@ from conftest import train_flags
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies.factory import get_policy_class
 from safetensors.torch import load_file
-from training_command import forget_after
+from training_command import forget_after, train_in_two_processes
 
 SMALL = ("--policy.backbone.type=mlp", "--policy.backbone.hidden_dim=16", "--policy.backbone.num_hidden=2")
 
@@ -86,28 +80,13 @@ def test_training_figures_are_logged(lerobot_train_command, small_maze, tmp_path
 def test_two_processes_train_one_cookbook(small_maze, tmp_path):
     """Two processes (DDP): the saved checkpoint knows every episode that either process saw.
 
-    With pairs and with corrective labels, which draw from the episodes seen so far. Started with torchrun:
-    ``accelerate launch --cpu --num_processes=2`` starts a single process on one machine.
+    With pairs and with corrective labels, which draw from the episodes seen so far.
     """
     output_dir = tmp_path / "run"
-    command = [
-        *("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"),
-        str(Path(sys.executable).with_name("lerobot-train")),
-        *train_flags("wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5", "--policy.corrective=demos"),
-    ]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
-    log = tmp_path / "log"
-    with log.open("w") as file:
-        run = subprocess.Popen(
-            [sys.executable, *command], env=environment, stdout=file, stderr=file, start_new_session=True
-        )
-        while run.poll() is None and "End of training" not in log.read_text():
-            time.sleep(0.2)
-        with contextlib.suppress(ProcessLookupError):  # torch's gloo can deadlock in processes that end
-            os.killpg(run.pid, signal.SIGKILL)
-        run.wait()
-    logged = log.read_text()
-    assert "End of training" in logged, logged[-3000:]
+    flags = train_flags(
+        "wzbc", small_maze, output_dir, 20, *SMALL, "--log_freq=5", "--policy.corrective=demos"
+    )
+    logged = train_in_two_processes(flags, tmp_path / "log")
     policy = load(output_dir)
     assert policy.styles.trained.all()
     assert "Effective batch size: 8 x 2 = 16" in logged

@@ -1,6 +1,12 @@
 """``lerobot-swr-train`` in this process, killed in the middle of a training, and what it leaves."""
 
+import contextlib
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -46,3 +52,25 @@ def forget_after(step: int, run: Path) -> None:
     for folder in (run / "checkpoints").iterdir():
         if folder.name.isdigit() and int(folder.name) > step:
             shutil.rmtree(folder)
+
+
+def train_in_two_processes(flags: list[str], log: Path) -> str:
+    """Run ``lerobot-train`` in two processes (DDP) to its end; gives what it logged.
+
+    Started with torchrun: ``accelerate launch --cpu --num_processes=2`` starts a single one on one machine.
+    """
+    command = [
+        *(sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"),
+        *(str(Path(sys.executable).with_name("lerobot-train")), *flags),
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    with log.open("w") as file:
+        run = subprocess.Popen(command, env=environment, stdout=file, stderr=file, start_new_session=True)
+        while run.poll() is None and "End of training" not in log.read_text():
+            time.sleep(0.2)
+        with contextlib.suppress(ProcessLookupError):  # torch's gloo can deadlock in processes that end
+            os.killpg(run.pid, signal.SIGKILL)
+        run.wait()
+    logged = log.read_text()
+    assert "End of training" in logged, logged[-3000:]
+    return logged
