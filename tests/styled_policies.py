@@ -1,5 +1,6 @@
 """Style policies over LeRobot's own policies and a plugin's, small and quick."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from lerobot.configs.default import DatasetConfig
 from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
 from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import PreTrainedPolicy, make_policy, make_pre_post_processors
-from lerobot.policies.factory import make_policy_config
+from lerobot.policies.factory import get_policy_class, make_policy_config
 from odd_datasets import PLAIN, arcs, feature, write
 
 from lerobot_swr.run_context import running
@@ -142,3 +143,24 @@ def data_of(request: pytest.FixtureRequest) -> Callable[[str], Path]:
         return request.getfixturevalue("camera_arcs" if kind == "smolvla" else "small_maze")
 
     return find
+
+
+def nested(kind: str, prefix: str = "policy.backbone.") -> list[str]:
+    """A small backbone on the command line."""
+    options = {"type": kind, **TINY[kind]}
+    return [f"--{prefix}{key}={_plain(value)}" for key, value in options.items()]
+
+
+def _plain(value) -> str:
+    return json.dumps(list(value) if isinstance(value, tuple) else value).strip('"')
+
+
+def checkpoint(folder: Path, step: str = "last") -> Path:
+    """A run's checkpoint."""
+    return folder / "checkpoints" / step / "pretrained_model"
+
+
+def load(folder: Path):
+    """A policy."""
+    config = PreTrainedConfig.from_pretrained(folder)
+    return get_policy_class(config.type).from_pretrained(folder, config=config)

@@ -9,10 +9,9 @@ import pytest
 import torch
 from conftest import train_flags
 from lerobot.configs import PreTrainedConfig
-from lerobot.policies.factory import get_policy_class
 from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
-from styled_policies import LENGTHS, TINY, batch_of, metadata_of
+from styled_policies import LENGTHS, batch_of, checkpoint, load, metadata_of, nested
 from training_command import assert_same_checkpoint, forget_after, train_in_two_processes
 
 from lerobot_swr.cli import eval as eval_command
@@ -20,27 +19,6 @@ from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.evaluation.checkpoint import load_checkpoint
 from lerobot_swr.evaluation.offline import frame_errors
 from lerobot_swr.trajectories import load_trajectories
-
-
-def nested(kind: str, prefix: str = "policy.backbone.") -> list[str]:
-    """A small backbone on the command line."""
-    options = {"type": kind, **TINY[kind]}
-    return [f"--{prefix}{key}={_plain(value)}" for key, value in options.items()]
-
-
-def _plain(value) -> str:
-    return json.dumps(list(value) if isinstance(value, tuple) else value).strip('"')
-
-
-def checkpoint(folder: Path, step: str = "last") -> Path:
-    """A run's checkpoint."""
-    return folder / "checkpoints" / step / "pretrained_model"
-
-
-def load(folder: Path):
-    """A policy."""
-    config = PreTrainedConfig.from_pretrained(folder)
-    return get_policy_class(config.type).from_pretrained(folder, config=config)
 
 
 @pytest.mark.parametrize(("policy_type", "kind"), [("zbc", "act"), ("wzbc", "diffusion")])
