@@ -295,7 +295,10 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             )
         tasks = cast(str | list[str], batch.get("task", []))
         n_envs = len(batch[OBS_STATE])
-        dimensions = self.config.dimensions  # of a window of observations the last one counts
-        seen = [batch[key].reshape(n_envs, -1)[:, -dimensions[key] :] for key in self.config.observation_keys]
-        scene = torch.cat(seen, dim=1)
+        scene = self._scene(batch, n_envs) if self.styles.drawing.sampling == "scene" else None
         return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks, scene)
+
+    def _scene(self, batch: dict[str, Any], n_envs: int) -> Tensor:
+        """(B, c) what is seen now, side by side; of a window of observations the last one counts."""
+        sizes = {key: self.config.dimensions[key] for key in self.config.observation_keys}
+        return torch.cat([batch[key].reshape(n_envs, -1)[:, -d:] for key, d in sizes.items()], dim=1)
