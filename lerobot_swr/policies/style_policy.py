@@ -1,6 +1,5 @@
 """A style policy: a cookbook of styles, a backbone that acts by them, and the steps of a lesson."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, Self, cast
 
@@ -19,7 +18,7 @@ from lerobot_swr.policies.row_adam import FROM_ROWS
 from lerobot_swr.policies.stored_styles import StoredStyles
 from lerobot_swr.policies.training_data import TrainingData, adopt_features, make_sampler, make_table
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.encoding import ENCODING_STEPS, ActionErrors, Frames, Imitation, encode_styles_by
+from lerobot_swr.styles.encoding import ActionErrors, Imitation
 from lerobot_swr.styles.held_out import HeldOutStyles
 from lerobot_swr.trajectories import Trajectories
 
@@ -206,24 +205,17 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         return replace(lesson, batch=self._as_outputs(batch))
 
     def _held_out_styles(self, batch: dict[str, Any]) -> Tensor | None:
-        return self.held_out.styles(self.encode, batch["episode_index"]) if self.has_styles else None
+        return self.held_out.styles(self.imitation, batch["episode_index"]) if self.has_styles else None
 
-    def encode(
-        self,
-        episodes: Sequence[Frames],
-        starts: Tensor,
-        steps: int = ENCODING_STEPS,
-        on_step: Callable[[], object] = lambda: None,
-    ) -> tuple[Tensor, Tensor]:
-        """Styles of demonstrations that were not trained on, and their errors, see `encode_styles_by`.
+    @property
+    def imitation(self) -> Imitation:
+        """How badly demonstrations are imitated under styles, to encode those that were not trained on.
 
-        Of a backbone that learns the present action the error is that of the action, else its loss.
+        Of a backbone that learns the present action the error is that of the action, else its own loss.
         """
-        traits = self.config.traits
-        imitation: Imitation = ActionErrors(self.predict)
-        if not traits.is_momentary:
-            imitation = LossErrors(self.backbone, bool(self.config.image_features))
-        return encode_styles_by(imitation, episodes, starts, steps, on_step)
+        if self.config.traits.is_momentary:
+            return ActionErrors(self.predict)
+        return LossErrors(self.backbone, bool(self.config.image_features))
 
     def update(self) -> None:
         """What the backbone does after each step of the optimizer; LeRobot's loop calls it."""

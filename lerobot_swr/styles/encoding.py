@@ -1,7 +1,7 @@
 """Finds styles for demonstrations that were not trained on: the network is frozen, z is optimised."""
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from lerobot.utils.constants import ACTION
@@ -20,6 +20,7 @@ FRAMES = 1024  # of each episode that count at all, evenly spread
 ROWS = 8192  # frames times starts that the network sees at once where no gradient is needed
 
 
+@runtime_checkable
 class Imitation(Protocol):
     """How badly episodes are imitated under styles; fixed numbers, whatever is drawn at random elsewhere.
 
@@ -57,26 +58,7 @@ class ActionErrors:
 
 
 def encode_styles(
-    network: Network,
-    episodes: Sequence[Frames],
-    starts: Tensor,
-    steps: int = ENCODING_STEPS,
-    on_step: Callable[[], object] = lambda: None,
-) -> tuple[Tensor, Tensor]:
-    """`encode_styles_by` the mean squared error of the normalised action that a network predicts.
-
-    Args:
-        network: π_θ(a | s, z).
-        episodes: E episodes of T_e frames.
-        starts: (E, K, style_dim) styles to start from.
-        steps: Number of Adam steps.
-        on_step: Called after each step, for a progress bar.
-    """
-    return encode_styles_by(ActionErrors(network), episodes, starts, steps, on_step)
-
-
-def encode_styles_by(
-    imitation: Imitation,
+    network: Network | Imitation,
     episodes: Sequence[Frames],
     starts: Tensor,
     steps: int = ENCODING_STEPS,
@@ -93,7 +75,8 @@ def encode_styles_by(
     memory do not grow with the episode's length.
 
     Args:
-        imitation: The error.
+        network: π_θ(a | s, z), whose error is the mean squared error of the normalised action; or another
+            error.
         episodes: E episodes of T_e frames.
         starts: (E, K, style_dim) styles to start from.
         steps: Number of Adam steps.
@@ -102,6 +85,7 @@ def encode_styles_by(
     Returns:
         (E, style_dim) styles and (E,) their errors.
     """
+    imitation = network if isinstance(network, Imitation) else ActionErrors(network)
     thinned = [_evenly(episode, imitation.frames) for episode in episodes]
     with torch.no_grad():
         best, best_error = starts, imitation.errors(thinned, starts)

@@ -15,7 +15,7 @@ from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.progress import Progress
 from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames
+from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames, Imitation, encode_styles
 from lerobot_swr.styles.filters import names_in
 from lerobot_swr.styles.table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
 from lerobot_swr.trajectories import Trajectories
@@ -36,10 +36,9 @@ class StyledNetwork(Protocol):
     config: Any
     styles: StyleCookbook
 
-    def encode(
-        self, episodes: Sequence[Frames], starts: Tensor, steps: int, on_step: Callable[[], object] = ...
-    ) -> tuple[Tensor, Tensor]:
-        """Styles of episodes and their errors, see `encoding.encode_styles_by`."""
+    @property
+    def imitation(self) -> Imitation:
+        """How badly it imitates episodes under styles."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +107,11 @@ def add_demonstrations(
     with Progress(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
         for part in parts:
             frames = [read(episode) for episode in chosen[part]]
-            found = policy.encode(frames, starts[part], ENCODING_STEPS, bar.update)
+            found = encode_styles(policy.imitation, frames, starts[part], ENCODING_STEPS, bar.update)
             began += [_first_observation(f, config.observation_keys) for f in frames]
             encoded.append(found[0])
             errors.append(found[1])
-            nearest_errors.append(policy.encode(frames, starts[part, :1], 0)[1])
+            nearest_errors.append(encode_styles(policy.imitation, frames, starts[part, :1], steps=0)[1])
 
     first = len(styles)
     numbers = list(chosen) if same else list(range(first, first + len(chosen)))

@@ -1,6 +1,6 @@
 """Styles of episodes that a policy in training does not train on, for the held-out loss."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -9,16 +9,13 @@ from torch import Tensor
 
 from lerobot_swr.similarity import Similarity
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.encoding import Frames
+from lerobot_swr.styles.encoding import Frames, Imitation, Network, encode_styles
 from lerobot_swr.trajectories import Trajectories
 
 # Encoding happens in the middle of training, so it spends less than `lerobot-swr-styles --add`.
 ENCODING_STEPS = 100
 FRAMES = 64  # per episode, evenly spread over it
 CHUNK = 32  # episodes encoded at once
-
-Encoder = Callable[[Sequence[Frames], Tensor, int], tuple[Tensor, Tensor]]
-"""Styles and errors of episodes from their starts in some steps, see `encoding.encode_styles_by`."""
 
 
 class Demonstrations(Protocol):
@@ -56,11 +53,11 @@ class HeldOutStyles:
         """Drop what was encoded: the policy changes."""
         self._encoded = {}
 
-    def styles(self, encoder: Encoder, episodes: Tensor) -> Tensor:
+    def styles(self, network: Network | Imitation, episodes: Tensor) -> Tensor:
         """(B, style_dim) styles of the (B,) `episodes`, encoded where they were not trained.
 
         Args:
-            encoder: Finds styles for the policy as it is now.
+            network: π_θ(a | s, z) as it is now, or how badly it imitates.
             episodes: (B,) int64.
 
         Raises:
@@ -70,13 +67,13 @@ class HeldOutStyles:
         styles = self._cookbook.embedding(episodes).clone()
         missing = [i for i in episodes[~trained[episodes]].unique().tolist() if i not in self._encoded]
         if missing:
-            self._encode(encoder, missing)
+            self._encode(network, missing)
         for place, episode in enumerate(episodes.tolist()):
             if episode in self._encoded:
                 styles[place] = self._encoded[episode]
         return styles
 
-    def _encode(self, encoder: Encoder, missing: Sequence[int]) -> None:
+    def _encode(self, network: Network | Imitation, missing: Sequence[int]) -> None:
         if self._data is None:
             raise RuntimeError("this needs the training dataset: create the policy with dataset_meta")
         lengths = self._data.trajectories.lengths
@@ -89,7 +86,7 @@ class HeldOutStyles:
         nearest, _ = self._data.similarity.nearest(np.array(missing), 1, candidates.cpu().numpy())
         starts = self._cookbook.embedding(torch.from_numpy(nearest).to(candidates.device)).detach()
         frames = [self._data.frames(i, _spread(int(lengths[i]))) for i in missing]
-        encoded, _ = encoder(frames, starts, ENCODING_STEPS)
+        encoded, _ = encode_styles(network, frames, starts, ENCODING_STEPS)
         self._encoded.update(zip(missing, encoded, strict=True))
 
 
