@@ -206,11 +206,12 @@ def _add(cfg: StylesCommand, checkpoint: Checkpoint, policy: StylePolicy) -> Non
     source = demonstration_frames(policy.config, meta, new, checkpoint.preprocessor)
     added = add_demonstrations(
         policy,
-        lambda i: source.frames(i, np.arange(new.lengths[i])),
+        checkpoint.preprocessor,
         training,
         new,
         cfg.episodes,
         meta.robot_type,
+        read=lambda episode: source.frames(episode, np.arange(new.lengths[episode])),
     )
     _save_new_checkpoint(cfg.checkpoint, policy, cfg.output_dir)
     error = "action error" if policy.config.traits.is_momentary else "loss"

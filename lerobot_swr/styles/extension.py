@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
@@ -60,11 +60,12 @@ class EncodedStyles:
 
 def add_demonstrations(
     policy: StyledNetwork,
-    read: Callable[[int], Frames],
+    preprocessor: Any,
     training: Trajectories,
     new: Trajectories,
     chosen: list[int] | None = None,
     robot_type: str | None = None,
+    read: Callable[[int], Frames] | None = None,
 ) -> EncodedStyles:
     """Give demonstrations that were not trained on a style of their own; the network stays as it is.
 
@@ -73,11 +74,12 @@ def add_demonstrations(
 
     Args:
         policy: The policy, changed in place.
-        read: The policy's inputs of an episode of `new`.
+        preprocessor: The policy's inputs of raw observations and actions.
         training: The dataset that the policy was trained on.
         new: The dataset with the new demonstrations, which has the features of the training dataset.
         chosen: Episodes of `new`; None takes all that have no style yet.
         robot_type: Of the new dataset's metadata; finds the behaviour rule of this package's datasets.
+        read: The policy's inputs of an episode of `new`, where they are more than columns of numbers.
 
     Raises:
         ValueError: If nothing is to be added, or a column of the table cannot be computed for `new`.
@@ -102,6 +104,7 @@ def add_demonstrations(
     rows = np.arange(len(training), len(both))  # the added ones
     ranked, _ = similarity.nearest(rows, STARTS, candidates)
     starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
+    read = read or (lambda episode: _columns(new.episode(episode), preprocessor, config))
     encoded, errors, nearest_errors, began = [], [], [], []
     parts = [slice(i, i + CHUNK) for i in range(0, len(chosen), CHUNK)]
     with Progress(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
@@ -124,6 +127,13 @@ def add_demonstrations(
     return EncodedStyles(
         numbers, ranked[:, 0].tolist(), torch.cat(errors).tolist(), torch.cat(nearest_errors).tolist()
     )
+
+
+def _columns(episode: dict[str, np.ndarray], preprocessor: Any, config: Any) -> Frames:
+    """A policy's inputs of an episode's numbers."""
+    keys = [*config.observation_keys, ACTION]
+    batch = preprocessor({key: torch.from_numpy(episode[key]) for key in keys})
+    return {key: batch[key] for key in keys}
 
 
 def _first_observation(episode: Frames, keys: Sequence[str]) -> Tensor:
