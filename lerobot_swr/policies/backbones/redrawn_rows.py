@@ -18,12 +18,17 @@ def redrawn(batch: dict[str, Any], weight: Tensor, uniform: float) -> tuple[dict
         The batch, of B rows, and the factor, which is the mean weight.
     """
     factor = float(weight.mean())
-    if factor == 0.0 or bool((weight == weight[0]).all()):
+    if weigh_alike(weight):
         return batch, factor
     rows = systematic_rows(weight, uniform)
     if torch.equal(rows, torch.arange(len(rows), device=rows.device)):
         return batch, factor
     return picked_rows(batch, rows), factor
+
+
+def weigh_alike(weight: Tensor) -> bool:
+    """Whether all (B,) weights are the same."""
+    return bool((weight == weight[0]).all())
 
 
 def systematic_rows(weight: Tensor, uniform: float) -> Tensor:

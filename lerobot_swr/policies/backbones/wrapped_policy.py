@@ -12,7 +12,7 @@ from lerobot.policies.factory import get_policy_class
 from torch import Tensor, nn
 
 from lerobot_swr.policies.backbones.backbone import Backbone, weighted_mean
-from lerobot_swr.policies.backbones.redrawn_rows import picked_rows, redrawn
+from lerobot_swr.policies.backbones.redrawn_rows import picked_rows, redrawn, weigh_alike
 from lerobot_swr.policies.backbones.style_place import StylePlace
 from lerobot_swr.random_streams import StepGenerator
 
@@ -50,7 +50,13 @@ class WrappedPolicy(Backbone):
     def loss(
         self, batch: dict[str, Tensor], style: Tensor | None, weight: Tensor
     ) -> tuple[Tensor, Tensor | None]:
-        """See `Backbone.loss`; what else the policy logs is in `numbers`."""
+        """See `Backbone.loss`; what else the policy logs is in `numbers`.
+
+        In evaluation nothing is redrawn: where frames weigh differently, their losses are taken one by one.
+        """
+        if not self.training and not self.knows_frames and not weigh_alike(weight):
+            losses = self.frame_losses(batch, style, weight)
+            return losses.mean(), losses
         with self._drawing(weight.device) as uniform:
             if self.knows_frames:
                 losses, numbers = self.policy.forward(self._styled(batch, style), reduction="none")
