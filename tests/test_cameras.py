@@ -14,6 +14,7 @@ from lerobot.envs.utils import env_to_policy_features
 from lerobot.scripts import lerobot_eval
 
 from lerobot_swr.cli import dataset as dataset_command
+from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.demos.catalog import get_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.demos.maze2d import _recipe, steady
@@ -194,6 +195,21 @@ def test_evaluations_read_the_simulators_states_of_every_kind_of_dataset(camera_
     episodes = list(read["pixels"].episodes())
     replays = play(cfg.create_rollout_env(3), episodes, list(map(cfg.start_rule(), episodes)), seed=0)
     assert all(replay.success for replay in replays)
+
+
+def test_replay_is_in_step_with_a_dataset_for_cameras(run_command, camera_datasets, tmp_path):
+    """``--baseline=replay`` compares the simulator's states, by their names."""
+    run_command(
+        eval_command.main,
+        "--baseline=replay",
+        "--env.type=maze2d",
+        "--env.task=small",
+        f"--dataset.root={camera_datasets / 'pixels'}",
+        f"--output_dir={tmp_path}",
+    )
+    result = json.loads((tmp_path / "replay.json").read_text())
+    assert result["success_rate"] == result["behavior_match"] == 1
+    assert ["x", "y"] in [group["columns"] for group in result["offsets"]]
 
 
 def test_the_command_adds_pictures(run_command, tmp_path, capsys):

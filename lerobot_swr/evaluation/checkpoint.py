@@ -15,7 +15,7 @@ from lerobot.utils.constants import ACTION, HF_LEROBOT_HOME, OBS_PREFIX, OBS_STA
 from lerobot_swr.dataset_checks import Shapes, check_dimensions, check_format, describe_features
 from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.envs.observed import SIMULATOR, as_simulated
-from lerobot_swr.trajectories import Trajectories, load_trajectories
+from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
 
 
 @dataclass
@@ -123,6 +123,11 @@ def load_demonstrations(meta: LeRobotDatasetMetadata) -> Trajectories:
 def in_simulation(trajectories: Trajectories) -> Trajectories:
     """Episodes as the simulator knows them, where the policy's own observations do not tell places."""
     return replace(trajectories, columns=as_simulated(trajectories.columns))
+
+
+def simulated_names(meta: LeRobotDatasetMetadata) -> dict[str, list[str]]:
+    """Names of the dimensions of what `load_demonstrations` reads."""
+    return as_simulated(dimension_names(meta, _low_dimensional(meta)))
 
 
 def load_reference(

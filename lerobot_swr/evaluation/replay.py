@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
-from lerobot_swr.evaluation.checkpoint import check_environment, load_demonstrations
+from lerobot_swr.evaluation.checkpoint import check_environment, load_demonstrations, simulated_names
 from lerobot_swr.evaluation.metrics import Interval, success_interval
 from lerobot_swr.evaluation.open_loop import Replay, play
 from lerobot_swr.evaluation.time_offsets import (
@@ -26,7 +26,6 @@ from lerobot_swr.evaluation.time_offsets import (
     deviations,
 )
 from lerobot_swr.progress import Progress
-from lerobot_swr.trajectories import dimension_names
 
 
 @dataclass(frozen=True)
@@ -104,7 +103,7 @@ def run_replay(
                 space = env.single_action_space
             finally:
                 env.close()
-    names = dimension_names(meta, list(trajectories.columns))
+    names = {key: value for key, value in simulated_names(meta).items() if key in trajectories.columns}
     result = evaluate_replays(chosen, recorded, replays, names, rule, space)
     return result, recorded, [replay.observations for replay in replays]
 

@@ -5,6 +5,8 @@ import importlib
 import os
 import platform
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from functools import lru_cache
 
 import numpy as np
@@ -25,12 +27,13 @@ class OffscreenCamera:
         model: A compiled scene.
         height: Of the pictures, in pixels.
         width: Of the pictures, in pixels.
+        fast: Without shadows, reflections and smooth edges, which cost a software renderer most of its time.
 
     Raises:
         RuntimeError: If no OpenGL renderer works here; says what to install.
     """
 
-    def __init__(self, model: "mujoco.MjModel", height: int, width: int):
+    def __init__(self, model: "mujoco.MjModel", height: int, width: int, fast: bool = False):
         self._model = model
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options = mujoco.MjvOption()
@@ -40,7 +43,8 @@ class OffscreenCamera:
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self._gl = _open_gl(width, height)
         self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        with _without_extras(model, self._scene) if fast else nullcontext():
+            self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         mujoco.mjr_resizeOffscreen(width, height, self._context)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self.close = weakref.finalize(self, _free, self._gl, self._context)
@@ -70,7 +74,21 @@ class OffscreenCamera:
 @lru_cache(maxsize=4)
 def shared_camera(model: "mujoco.MjModel", size: int) -> OffscreenCamera:
     """The process's camera for observations of a scene, size × size pixels; it belongs to one thread."""
-    return OffscreenCamera(model, size, size)
+    return OffscreenCamera(model, size, size, fast=True)
+
+
+@contextmanager
+def _without_extras(model: "mujoco.MjModel", scene: "mujoco.MjvScene") -> Iterator[None]:
+    """Let a context be made that has no room for shadows and draws every pixel once."""
+    for flag in (mujoco.mjtRndFlag.mjRND_SHADOW, mujoco.mjtRndFlag.mjRND_REFLECTION):
+        scene.flags[flag] = 0
+    quality = model.vis.quality
+    usual = quality.shadowsize, quality.offsamples
+    quality.shadowsize, quality.offsamples = 0, 0
+    try:
+        yield
+    finally:
+        quality.shadowsize, quality.offsamples = usual
 
 
 def _open_gl(width: int, height: int):
