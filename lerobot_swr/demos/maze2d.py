@@ -14,10 +14,11 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.interpolate import PchipInterpolator
 
 from lerobot_swr.demos.recipe import DatasetRecipe, Demonstration
+from lerobot_swr.envs.maze2d.agents import MazeAgents
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
-from lerobot_swr.envs.maze2d.camera import MazeCamera
+from lerobot_swr.envs.maze2d.camera import CAMERA_SIZE, MazeCamera
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal
-from lerobot_swr.envs.maze2d.env import CAMERA_SIZE, FPS, INSTRUCTION, MazeAgents
+from lerobot_swr.envs.maze2d.env import FPS, INSTRUCTION
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, get_layout
 from lerobot_swr.envs.maze2d.scenes import draw_scene, draw_start, maze_of, scene_names
 

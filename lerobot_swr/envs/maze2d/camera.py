@@ -8,6 +8,7 @@ import numpy as np
 from lerobot_swr.envs.maze2d.layouts import MazeLayout
 from lerobot_swr.envs.maze2d.scenes import maze_of
 
+CAMERA_SIZE = 64  # pixels
 AGENT_RADIUS = 0.03
 WALL_HALF_WIDTH = 0.012
 _FLOOR, _WALL, _GOAL, _AGENT = (

@@ -12,9 +12,11 @@ from lerobot.utils.constants import ACTION, OBS_ENV_STATE, OBS_STATE
 
 from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.configuration_env import TaskEnvConfig
+from lerobot_swr.envs.maze2d.agents import MazeAgents
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
+from lerobot_swr.envs.maze2d.camera import CAMERA_SIZE
 from lerobot_swr.envs.maze2d.dynamics import in_goal
-from lerobot_swr.envs.maze2d.env import CAMERA_SIZE, FPS, Maze2DVectorEnv, MazeAgents
+from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, Scenes, get_layout
 from lerobot_swr.envs.maze2d.scenes import scene_names
 from lerobot_swr.envs.observed import PICTURE_NAMES, picture_features
