@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from lerobot_swr.envs.d3il.dependencies import mujoco
-from lerobot_swr.envs.d3il.scene import CAMERA
+from lerobot_swr.envs.d3il.scene import CAMERA, SQUARE_CAMERA
 
 _HINT = (
     "On a machine without a screen install a software renderer and name it: Debian/Ubuntu `apt-get install "
@@ -21,25 +21,28 @@ _HINT = (
 
 
 class OffscreenCamera:
-    """Renders the scene's camera into arrays; owns one OpenGL context, which `close` frees.
+    """Renders a camera of the scene into arrays; owns one OpenGL context, which `close` frees.
 
     Args:
         model: A compiled scene.
         height: Of the pictures, in pixels.
         width: Of the pictures, in pixels.
+        name: Of the camera.
         fast: Without shadows, reflections and smooth edges, which cost a software renderer most of its time.
 
     Raises:
         RuntimeError: If no OpenGL renderer works here; says what to install.
     """
 
-    def __init__(self, model: "mujoco.MjModel", height: int, width: int, fast: bool = False):
+    def __init__(
+        self, model: "mujoco.MjModel", height: int, width: int, name: str = CAMERA, fast: bool = False
+    ):
         self._model = model
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
         self._options = mujoco.MjvOption()
         self._view = mujoco.MjvCamera()
         self._view.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._view.fixedcamid = model.camera(CAMERA).id
+        self._view.fixedcamid = model.camera(name).id
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self._gl = _open_gl(width, height)
         self._gl.make_current()
@@ -74,7 +77,7 @@ class OffscreenCamera:
 @lru_cache(maxsize=4)
 def shared_camera(model: "mujoco.MjModel", size: int) -> OffscreenCamera:
     """The process's camera for observations of a scene, size × size pixels; it belongs to one thread."""
-    return OffscreenCamera(model, size, size, fast=True)
+    return OffscreenCamera(model, size, size, SQUARE_CAMERA, fast=True)
 
 
 @contextmanager

@@ -5,6 +5,8 @@ from lerobot_swr.envs.d3il.dependencies import mujoco
 
 TABLE_TOP_Z = -0.019
 CAMERA = "overview"
+SQUARE_CAMERA = "square overview"
+"""The same place, with an angle that shows all of the table's used part in a square picture."""
 
 _TABLE_HALF_SIZE = (0.49, 0.98, 0.001)
 _FLOOR_Z = -0.9
@@ -66,10 +68,11 @@ def _add_light_and_camera(
     spec.visual.headlight.diffuse = (0.45, 0.45, 0.45)
     spec.worldbody.add_light(pos=(0.9, -0.6, 1.8), dir=(-0.3, 0.4, -1.0), diffuse=(0.5, 0.5, 0.5))
     target = spec.worldbody.add_body(name="camera_target", pos=camera_target)
-    spec.worldbody.add_camera(
-        name=CAMERA,
-        pos=camera_position,
-        mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
-        targetbody=target.name,
-        fovy=36.0,
-    )
+    for name, angle in ((CAMERA, 36.0), (SQUARE_CAMERA, 46.0)):
+        spec.worldbody.add_camera(
+            name=name,
+            pos=camera_position,
+            mode=mujoco.mjtCamLight.mjCAMLIGHT_TARGETBODY,
+            targetbody=target.name,
+            fovy=angle,
+        )
