@@ -29,7 +29,7 @@ from lerobot_swr.policies.configuration_swr import ZBCConfig
 from lerobot_swr.policies.demonstration_frames import demonstration_frames
 from lerobot_swr.policies.style_policy import StylePolicy
 from lerobot_swr.policies.training_data import read_demonstrations
-from lerobot_swr.similarity import similarity_of
+from lerobot_swr.similarity import similarity_by
 from lerobot_swr.styles.extension import add_demonstrations
 from lerobot_swr.styles.map import write_style_map
 from lerobot_swr.styles.report import format_preview, format_table
@@ -158,7 +158,7 @@ def _make_table_anew(cfg: StylesCommand, config: ZBCConfig) -> None:
     policy, meta = checkpoint.policy, cfg.dataset.metadata()
     stored = policy.styles.table
     demonstrations = read_demonstrations(config, meta)
-    similarity = similarity_of(demonstrations, config.compared_keys, Path(meta.root))
+    similarity = similarity_by(demonstrations, config.manner, Path(meta.root))
     table = make_nearest_table(
         demonstrations, similarity, config.behavior_rule, config.style_metrics, meta.robot_type
     )

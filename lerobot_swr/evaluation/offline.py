@@ -13,7 +13,7 @@ from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
 from lerobot_swr.policies.demonstration_frames import dataset_frames
 from lerobot_swr.policies.style_policy import StylePolicy
-from lerobot_swr.similarity import similarity_of
+from lerobot_swr.similarity import similarity_by
 from lerobot_swr.trajectories import Trajectories
 
 BATCH = 4096
@@ -115,7 +115,7 @@ def _styles_of_frames(
     policy: StylePolicy, trajectories: Trajectories, drawable: np.ndarray, own: np.ndarray, seed: int
 ) -> dict[str, np.ndarray | None]:
     """Kind of style to the (F,) episodes whose styles the frames use."""
-    similarity = similarity_of(trajectories, policy.config.compared_keys, Path(trajectories.name))
+    similarity = similarity_by(trajectories, policy.config.manner, Path(trajectories.name))
     nearest = similarity.nearest(drawable, 1, drawable)[0][:, 0].astype(np.int64)
     place = np.searchsorted(drawable, own)
     shift = np.random.default_rng(seed).integers(1, len(drawable), size=len(own))

@@ -23,7 +23,7 @@ from lerobot_swr.policies.backbones.traits import Traits
 from lerobot_swr.policies.processor_swr import Pipelines
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.sampling import check_partner_sampling, check_probability
-from lerobot_swr.similarity import check_beta, check_normalization
+from lerobot_swr.similarity import Manner, check_beta, check_normalization
 from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.styles.selection import StyleSelection
 
@@ -58,6 +58,11 @@ class BCConfig(StateConfig):
     # Leave out the frames in which a demonstrator pauses before moving on. A policy without memory cannot
     # wait: it would learn to creep there. Deviates from the paper where demonstrations have pauses.
     skip_pauses: bool = True
+
+    # --- Things in the observation ---
+    # Feature to the names of its dimensions, in which hand and objects are found (box.x, box.y, box.qw, ...);
+    # null takes the dataset's own names, and is replaced by them where an option looks for things.
+    dimension_names: dict[str, list[str]] | None = None
 
     # --- Set from the dataset; not meant to be given ---
     # Number of episodes of the training dataset.
@@ -158,6 +163,16 @@ class BCConfig(StateConfig):
         """The features over which ν compares demonstrations; pictures are none."""
         return self.observation_keys
 
+    @property
+    def manner(self) -> Manner:
+        """What of demonstrations ν compares."""
+        return Manner(tuple(self.compared_keys))
+
+    @property
+    def looks_for_things(self) -> bool:
+        """Whether an option needs the names of the observation's dimensions."""
+        return False
+
 
 @PreTrainedConfig.register_subclass("zbc")
 @dataclass
@@ -169,18 +184,36 @@ class ZBCConfig(BCConfig):
     # --- Styles ---
     # Dimension of a style z.
     style_dim: int = 10
+    # Where styles start: "normal" (at random) or "similarity" (principal coordinates of what similarity
+    # compares, the first with a standard deviation of 1). For scenes that vary, see docs/scenes.md.
+    style_init: str = "normal"
+    # Standard deviation of noise on the styles in training; null takes 0.1 for style_init=similarity, else 0.
+    style_noise: float | None = None
     # Standard deviation of the styles' normal initialisation. The paper's code leaves PyTorch's 1.0, which
     # needs several times more steps.
     style_init_scale: float = 0.1
-    # Learning rate of the styles, in units of optimizer_lr. A style learns from its own episode alone: with
-    # the paper's 1 it lags behind the network.
-    style_lr_scale: float = 5.0
+    # Learning rate of the styles, in units of optimizer_lr; null takes 5 for mlp, as a style learns from its own
+    # episode alone and with the paper's 1 lags behind the network, and 0 for style_init=similarity, whose
+    # styles then stay as they are.
+    style_lr_scale: float | None = None
     # Learning rate of the styles; null takes style_lr_scale times optimizer_lr for mlp, 0.005 for other
     # backbones, whose presets range from 1e-5 to 1e-3. Weight decay is 0 on styles.
     style_lr: float | None = None
     # Which observation of a LeRobot policy the style extends: "environment_state", "state", or "auto", the
     # first of them through which it reaches the network. mlp does not need it.
     style_key: str = AUTO
+
+    # --- Similarity of demonstrations ---
+    # Features, in their own units, over which demonstrations are compared; null takes all observations that
+    # the network sees.
+    similarity_keys: list[str] | None = None
+    # Compare the hand's path in the frame of this object instead (and the similarity_keys that are named).
+    similarity_frame: str | None = None
+    # How far from the object that path saturates, in units of its position.
+    similarity_scale: float = 0.1
+    # Compare what a function tells of an episode instead: module:function, {feature: (T, d)} -> (k,) or
+    # (T, k).
+    similarity_features: str | None = None
 
     # --- Corrective labels: beyond the paper, see docs/contracting.md ---
     # Teach every style the way back to its demonstration, from states beside it: "none" (the paper), "noise"
@@ -229,6 +262,10 @@ class ZBCConfig(BCConfig):
     # relative to the state.
     action_targets: list[int] | None = None
 
+    # --- Set from the dataset by style_init=similarity; not meant to be given ---
+    # Frames and dimensions of what is compared.
+    embedded_shape: tuple[int, int] | None = None
+
     # --- Set by lerobot-swr-styles --add; not meant to be given ---
     # Number of styles that were encoded for episodes of other datasets, after those of the training dataset.
     num_added_styles: int = 0
@@ -245,8 +282,7 @@ class ZBCConfig(BCConfig):
             raise ValueError(f"style_dim={self.style_dim}: expected at least 1")
         if not self.style_init_scale >= 0:
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
-        if not self.style_lr_scale > 0:
-            raise ValueError(f"style_lr_scale={self.style_lr_scale}: expected a number > 0; the paper uses 1")
+        self._settle_style_init()
         if self.style_lr is not None and not self.style_lr > 0:
             raise ValueError(f"style_lr={self.style_lr}: expected a number > 0")
         check_style_place(self.style_key)
@@ -267,6 +303,68 @@ class ZBCConfig(BCConfig):
                     f"style_interpolate={self.style_interpolate} fixes the style: leave out style_episodes, "
                     "style_filter and style_like"
                 )
+
+    def _settle_style_init(self) -> None:
+        """Check how styles start, and fill in what depends on it."""
+        if self.style_init not in ("normal", "similarity"):
+            raise ValueError(f"style_init={self.style_init!r}: expected 'normal' or 'similarity'")
+        embedded = self.style_init == "similarity"
+        if self.style_noise is None:
+            self.style_noise = 0.1 if embedded else 0.0
+        scale = self.style_lr_scale
+        if scale is not None and not (scale > 0 or (embedded and scale == 0)):
+            raise ValueError(
+                f"style_lr_scale={self.style_lr_scale}: expected a number > 0; the paper uses 1, and "
+                "style_init=similarity may do with 0"
+            )
+        if not self.style_noise >= 0:
+            raise ValueError(f"style_noise={self.style_noise}: expected a number >= 0")
+        if not self.similarity_scale > 0:
+            raise ValueError(f"similarity_scale={self.similarity_scale}: expected a number > 0, e.g. 0.1")
+        if self.similarity_features is not None and (self.similarity_frame or self.similarity_keys):
+            raise ValueError(
+                f"similarity_features={self.similarity_features!r} says all that is compared: leave out "
+                "similarity_frame and similarity_keys"
+            )
+
+    @property
+    def compared_keys(self) -> list[str]:
+        """The features over which ν compares demonstrations.
+
+        Raises:
+            ValueError: If a configured feature is unknown.
+        """
+        keys = self.similarity_keys or self.observation_keys
+        known = [*self.observation_keys, ACTION]
+        unknown = [key for key in keys if key not in known]
+        if unknown:
+            raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
+        return keys
+
+    @property
+    def manner(self) -> Manner:
+        """What of demonstrations ν compares.
+
+        Raises:
+            ValueError: If a configured feature is unknown.
+        """
+        is_plain = self.similarity_frame is None and self.similarity_features is None
+        keys = self.compared_keys if is_plain or self.similarity_keys else []
+        names = self.dimension_names or {}
+        return Manner(
+            tuple(keys), self.similarity_frame, self.similarity_scale, names, self.similarity_features
+        )
+
+    @property
+    def looks_for_things(self) -> bool:
+        """Whether an option needs the names of the observation's dimensions."""
+        return super().looks_for_things or self.similarity_frame is not None
+
+    @property
+    def has_fixed_styles(self) -> bool:
+        """Whether styles stay as they were made."""
+        is_left_open = self.style_lr_scale is None and self.style_lr is None
+        return self.style_lr_scale == 0 or (is_left_open and self.style_init == "similarity")
 
     @property
     def styles_lr(self) -> float:
@@ -304,9 +402,6 @@ class WZBCConfig(ZBCConfig):
     partner_sampling: str = "weighted"
     # Divide distances by the farthest episode of each demonstration ("row", the paper) or of all ("global").
     similarity_normalization: str = "row"
-    # Features, in their own units, over which demonstrations are compared; null takes all observations of
-    # numbers. Pictures are not compared.
-    similarity_keys: list[str] | None = None
 
     @tells_bad_values
     def __post_init__(self) -> None:
@@ -320,17 +415,3 @@ class WZBCConfig(ZBCConfig):
         check_probability(self.p)
         check_partner_sampling(self.partner_sampling)
         check_normalization(self.similarity_normalization)
-
-    @property
-    def compared_keys(self) -> list[str]:
-        """The features over which ν compares demonstrations.
-
-        Raises:
-            ValueError: If a configured feature is unknown.
-        """
-        keys = self.similarity_keys or self.observation_keys
-        known = [*self.observation_keys, ACTION]
-        unknown = [key for key in keys if key not in known]
-        if unknown:
-            raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
-        return keys

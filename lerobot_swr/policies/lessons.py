@@ -2,7 +2,8 @@
 
 LeRobot's loop gives a batch of frames, each from an episode i; its sampler cannot be replaced. Which style a
 frame teaches, how much it counts and which frames are replaced by corrective ones is decided here, within the
-policy's `forward`: `Balance`, then `Correct` (optional), then `Relabel` (wzbc), which is algorithm 1.
+policy's `forward`: `Balance`, then `Correct` (optional), then `Relabel` (wzbc), which is algorithm 1, then
+`Blur` (optional).
 """
 
 from collections.abc import Mapping, Sequence
@@ -11,6 +12,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 import torch
+from scipy.special import ndtri
 from torch import Tensor, nn
 
 from lerobot_swr.corrective.frames import CorrectiveStream
@@ -19,7 +21,7 @@ from lerobot_swr.random_streams import StepGenerator
 from lerobot_swr.sampling import PartnerSampler
 from lerobot_swr.trajectories import Trajectories
 
-CORRECTIVE_STREAM = 1  # of random numbers; pairs are drawn from stream 0
+CORRECTIVE_STREAM, NOISE_STREAM = 1, 2  # of random numbers; pairs are drawn from stream 0
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Lesson:
         episode: (B,) int64, the episode whose style the frame teaches.
         teaches_style: (B,) bool, whether its gradient flows into that style, or into the network alone.
         corrective: (B,) bool, which frames are corrective labels; None without them.
+        noise: (B, style_dim) what is added to the styles; None for nothing.
     """
 
     batch: dict[str, Any]
@@ -39,6 +42,7 @@ class Lesson:
     episode: Tensor
     teaches_style: Tensor
     corrective: Tensor | None = None
+    noise: Tensor | None = None
 
     @classmethod
     def of(cls, batch: dict[str, Any]) -> Self:
@@ -50,14 +54,15 @@ class Lesson:
     def tensors(self, keys: Sequence[str]) -> dict[str, Tensor]:
         """The lesson by name, with the features `keys` of its batch."""
         own = {"weight": self.weight, "episode": self.episode, "teaches_style": self.teaches_style}
-        return {**{key: self.batch[key] for key in keys}, **own}
+        noise = {} if self.noise is None else {"noise": self.noise}
+        return {**{key: self.batch[key] for key in keys}, **own, **noise}
 
     @classmethod
     def of_tensors(cls, tensors: Mapping[str, Tensor]) -> Self:
         """The lesson that `tensors` gave, without what is only logged."""
         batch = dict(tensors)
         weight, episode, teaches = (batch.pop(key) for key in ("weight", "episode", "teaches_style"))
-        return cls(batch, weight, episode, teaches)
+        return cls(batch, weight, episode, teaches, noise=batch.pop("noise", None))
 
 
 class LessonStep(Protocol):
@@ -234,6 +239,34 @@ class Relabel(nn.Module):
             numbers["relabelled_loss"] = float(values @ relabelled) / share / p
             numbers["mean_weight"] = float(weights @ relabelled) / share / p
         return numbers
+
+
+class Blur(nn.Module):
+    """Adds normal noise to the styles, so that styles near to each other come to mean the same.
+
+    Args:
+        deviation: Standard deviation of the noise.
+        style_dim: Dimension of a style.
+
+    Attributes:
+        draws: Source of the random numbers.
+    """
+
+    def __init__(self, deviation: float, style_dim: int):
+        super().__init__()
+        self.draws = StepGenerator(NOISE_STREAM)
+        self._deviation, self._style_dim = deviation, style_dim
+
+    def forward(self, lesson: Lesson, steps: int) -> Lesson:
+        """Draw the noise."""
+        count = len(lesson.episode)
+        uniforms = self.draws.uniforms(steps, count // steps * self._style_dim)
+        normal = ndtri(np.maximum(uniforms, 1e-9)).astype(np.float32).reshape(count, -1)
+        return replace(lesson, noise=torch.from_numpy(self._deviation * normal).to(lesson.episode.device))
+
+    def log(self, lesson: Lesson, losses: Tensor) -> dict[str, float]:
+        """Nothing."""
+        return {}
 
 
 def logged(steps: Sequence[LessonStep], lesson: Lesson, losses: Tensor | None) -> dict[str, float]:

@@ -12,11 +12,18 @@ from torch import Tensor
 from lerobot_swr.corrective.relative_actions import RelativeActions
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.dynamics import adopt_dynamics, make_relative_actions
-from lerobot_swr.policies.lessons import Balance, Correct, Lesson, LessonStep, Relabel, logged
+from lerobot_swr.policies.lessons import Balance, Blur, Correct, Lesson, LessonStep, Relabel, logged
 from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
 from lerobot_swr.policies.stored_styles import StoredStyles
-from lerobot_swr.policies.training_data import TrainingData, adopt_features, make_sampler, make_table
+from lerobot_swr.policies.training_data import (
+    TrainingData,
+    adopt_features,
+    adopt_names,
+    make_embedding,
+    make_sampler,
+    make_table,
+)
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.encoding import ActionErrors, Imitation
 from lerobot_swr.styles.held_out import HeldOutStyles
@@ -41,7 +48,8 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         relative: Translates between actions and the backbone's, where these are relative to the state.
         balance: The first step of a lesson; None where there is no dataset.
         correct: The second, with corrective labels.
-        relabel: The last, of ``wzbc``.
+        relabel: The third, of ``wzbc``.
+        blur: The last, with noise on the styles.
         data: The training dataset; None at inference.
 
     Raises:
@@ -59,6 +67,8 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         self._has_learned = False
         self.features_of = "environment" if dataset_meta is None else f"dataset {dataset_meta.root}"
         adopt_features(config, dataset_meta)
+        if dataset_meta is not None:
+            adopt_names(config, dataset_meta)
         self.data: TrainingData | None = None
         self.balance: Balance | None = None
         if dataset_meta is not None:
@@ -74,6 +84,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         self.relative: RelativeActions | None = None
         self.correct: Correct | None = None
         self.relabel: Relabel | None = None
+        self.blur: Blur | None = None
         if isinstance(config, ZBCConfig):
             self._add_styles(config)
         if isinstance(config, WZBCConfig):
@@ -99,6 +110,11 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             config.near_scenes,
         )
         self.held_out = HeldOutStyles(self.styles, data)
+        if config.style_init == "similarity":
+            self.styles.embed(make_embedding(config, data), None if data is None else data.compared)
+        self.styles.embedding.requires_grad_(not config.has_fixed_styles)
+        if config.style_noise:
+            self.blur = Blur(config.style_noise, config.style_dim)
         self.relative = make_relative_actions(config)
         stream = None
         if dynamics is not None and data is not None and self.balance is not None:
@@ -127,13 +143,13 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
     @property
     def steps(self) -> list[LessonStep]:
         """The steps that make a lesson of a batch, in order."""
-        steps: tuple[LessonStep | None, ...] = (self.balance, self.correct, self.relabel)
+        steps: tuple[LessonStep | None, ...] = (self.balance, self.correct, self.relabel, self.blur)
         return [step for step in steps if step is not None]
 
     def get_optim_params(self) -> Any:
         """The backbone's parameters, and the styles with a learning rate of their own."""
         groups = self.backbone.param_groups()
-        if not isinstance(self.config, ZBCConfig):
+        if not isinstance(self.config, ZBCConfig) or self.config.has_fixed_styles:
             return groups
         if isinstance(groups, dict):  # the optimizer gives rates by name
             return {**groups, **{f"styles.{name}": value for name, value in self.styles.named_parameters()}}
@@ -196,7 +212,8 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if not self.has_styles:
             return None
         style = self.styles(lesson.episode)
-        return torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
+        style = torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
+        return style if lesson.noise is None else style + lesson.noise
 
     def _held_out_lesson(self, batch: dict[str, Any]) -> Lesson:
         lesson = Lesson.of(batch)
@@ -205,7 +222,12 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         return replace(lesson, batch=self._as_outputs(batch))
 
     def _held_out_styles(self, batch: dict[str, Any]) -> Tensor | None:
-        return self.held_out.styles(self.imitation, batch["episode_index"]) if self.has_styles else None
+        if not isinstance(self.config, ZBCConfig):
+            return None
+        episodes = batch["episode_index"]
+        if self.config.has_fixed_styles:  # those of all of the dataset's episodes are known
+            return self.styles(episodes)
+        return self.held_out.styles(self.imitation, episodes)
 
     @property
     def imitation(self) -> Imitation:

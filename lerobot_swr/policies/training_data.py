@@ -25,6 +25,7 @@ from lerobot_swr.run_context import RunContext
 from lerobot_swr.sampling import PartnerSampler
 from lerobot_swr.scene_variation import SceneVariation, scene_variation
 from lerobot_swr.similarity import Similarity, similarity_of
+from lerobot_swr.styles.embedding import MannerEmbedding
 from lerobot_swr.styles.encoding import Frames
 from lerobot_swr.styles.table import LABELLED_BY, OUTCOMES, StyleTable, make_nearest_table
 from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
@@ -80,6 +81,24 @@ def adopt_features(config: StateConfig, meta: LeRobotDatasetMetadata | None) -> 
         for key, ft in features.items():
             if key in config.dimensions and not config.sees_images:
                 features[key] = PolicyFeature(ft.type, (config.dimensions[key],))
+
+
+def adopt_names(config: BCConfig, meta: LeRobotDatasetMetadata) -> None:
+    """Note in a configuration the names of dimensions, where one of its options looks for things.
+
+    Raises:
+        ValueError: If names are given of a feature that is not looked at, or not as many as its dimensions.
+    """
+    given, dimensions = config.dimension_names or {}, config.dimensions
+    for key, names in given.items():
+        if len(names) != dimensions.get(key):
+            known = ", ".join(f"{name} ({d})" for name, d in dimensions.items())
+            raise ValueError(
+                f"dimension_names={{{key}: ...}} has {len(names)} names; features and their dimensions are: "
+                f"{known}"
+            )
+    if config.looks_for_things:
+        config.dimension_names = {**dimension_names(meta, list(dimensions)), **given}
 
 
 def _usable(key: str, meta: LeRobotDatasetMetadata) -> bool:
@@ -184,9 +203,14 @@ class TrainingData:
         return self.trajectories if self.pauses is None else self.trajectories.without(self.pauses)
 
     @cached_property
+    def compared(self) -> Trajectories:
+        """What ν compares of the episodes."""
+        return self.config.manner.of(self.trajectories)
+
+    @cached_property
     def similarity(self) -> Similarity:
-        """Distances of the episodes over the features that ν compares."""
-        return similarity_of(self.trajectories, self.config.compared_keys, self.root)
+        """Distances of the episodes over what ν compares."""
+        return similarity_of(self.compared, self.config.manner.columns, self.root)
 
     @cached_property
     def scene_variation(self) -> SceneVariation:
@@ -237,6 +261,25 @@ def make_sampler(config: WZBCConfig, data: TrainingData) -> PartnerSampler:
         config.similarity_normalization,  # type: ignore[arg-type]
         config.partner_sampling,  # type: ignore[arg-type]
     )
+
+
+def make_embedding(config: ZBCConfig, data: TrainingData | None) -> MannerEmbedding:
+    """What gives demonstrations their styles by what similarity compares: of the dataset, or to be loaded.
+
+    Raises:
+        ValueError: If the demonstrations that are trained on are all alike.
+    """
+    columns = config.manner.columns
+    if data is not None:
+        trained = np.array(data.run.episodes)
+        width = data.compared.joined(columns).shape[1]
+        config.embedded_shape = (int(data.compared.lengths[trained].max()), width)
+    if config.embedded_shape is None:
+        raise ValueError("style_init='similarity': this takes effect when a policy is created with a dataset")
+    embedding = MannerEmbedding(config.style_dim, *config.embedded_shape)
+    if data is not None:
+        embedding.fit(data.compared.joined(columns), data.compared.lengths, trained)
+    return embedding
 
 
 def make_table(config: ZBCConfig, data: TrainingData) -> StyleTable:

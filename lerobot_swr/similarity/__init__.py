@@ -8,6 +8,8 @@
 * `neighbours`: the farthest and the nearest of many episodes, found by sketches and measured by vectors.
 * `cache`: what was found, kept beside the dataset.
 
+* `manner`: what of a demonstration is compared: its states, the hand's path about an object, or features.
+
 Training, pictures, the table of styles and the evaluations ask here; nobody else computes ν or W.
 """
 
@@ -17,14 +19,17 @@ from lerobot_swr.similarity.distances import (
     check_normalization,
     similarity_weights,
 )
-from lerobot_swr.similarity.measure import Dissimilarity, Similarity, similarity_of
+from lerobot_swr.similarity.manner import Manner
+from lerobot_swr.similarity.measure import Dissimilarity, Similarity, similarity_by, similarity_of
 
 __all__ = [
     "Dissimilarity",
+    "Manner",
     "Normalization",
     "Similarity",
     "check_beta",
     "check_normalization",
+    "similarity_by",
     "similarity_of",
     "similarity_weights",
 ]

@@ -15,6 +15,7 @@ from lerobot_swr.similarity.distances import (
     dissimilarities,
     pairwise_distances,
 )
+from lerobot_swr.similarity.manner import Manner
 from lerobot_swr.similarity.neighbours import Survey, survey
 from lerobot_swr.similarity.sketch import Sketch, make_sketch
 from lerobot_swr.similarity.vectors import EpisodeVectors
@@ -72,6 +73,11 @@ def similarity_of(
     if len(trajectories) <= dense_up_to:
         return DenseSimilarity(pairwise_distances(trajectories.states(keys)))
     return SketchedSimilarity(trajectories, keys, root)
+
+
+def similarity_by(trajectories: Trajectories, manner: Manner, root: Path) -> Similarity:
+    """The similarity of a dataset's episodes by what is to be compared of them, see `similarity_of`."""
+    return similarity_of(manner.of(trajectories), manner.columns, root)
 
 
 class DenseSimilarity:

@@ -9,10 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling, one_of_each
+from lerobot_swr.styles.embedding import MannerEmbedding
 from lerobot_swr.styles.request import StyleRequest, Styles, as_request
 from lerobot_swr.styles.scenes import Scenes
 from lerobot_swr.styles.selection import StyleSelection
 from lerobot_swr.styles.table import StyleTable
+from lerobot_swr.trajectories import Trajectories
 
 BLENDED = -1  # stands in `StyleCookbook.active` for a style that is no single episode's
 
@@ -30,6 +32,7 @@ class StyleCookbook(nn.Module):
         selection: Which styles may be drawn.
         drawing: How they are drawn.
         scenes: How each demonstration began.
+        embedded: What gives demonstrations their styles; None where they start at random.
         asked: What rollouts use instead: styles, or a selection to draw from; None for neither.
 
     Args:
@@ -62,6 +65,7 @@ class StyleCookbook(nn.Module):
         self.drawing = StyleDrawing(sampling)
         self.embedding = nn.Embedding(num_episodes, style_dim)
         nn.init.normal_(self.embedding.weight, std=init_scale)
+        self.embedded: MannerEmbedding | None = None
         self.trained: Tensor
         self.register_buffer("trained", torch.zeros(num_episodes, dtype=torch.uint8))
         self.table: StyleTable | None = None
@@ -96,6 +100,13 @@ class StyleCookbook(nn.Module):
                 f"a batch holds frames of episodes {others}, which the policy was not made to train on: name "
                 "them in --dataset.episodes or, in Python, create the policy within run_context.running(...)"
             )
+
+    def embed(self, embedding: MannerEmbedding, compared: Trajectories | None) -> None:
+        """Let styles be coordinates of what ν compares of the demonstrations; None: they are to be loaded."""
+        self.embedded = embedding
+        if compared is not None:
+            with torch.no_grad():
+                self.embedding.weight.copy_(embedding.of(compared))
 
     # --- Choosing styles ---
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
 from lerobot_swr.progress import Progress
-from lerobot_swr.similarity import Similarity, similarity_of
+from lerobot_swr.similarity import Similarity, similarity_by
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames, Imitation, encode_styles
 from lerobot_swr.styles.filters import names_in
@@ -99,18 +99,22 @@ def add_demonstrations(
     described = None if same else _described(policy, added, robot_type)
 
     candidates = np.flatnonzero(trained)
-    both = training.followed_by(added, config.compared_keys)
-    similarity = similarity_of(both, config.compared_keys, Path(training.name))
+    both = training.followed_by(added, list(config.dimensions))
+    similarity = similarity_by(both, config.manner, Path(training.name))
     rows = np.arange(len(training), len(both))  # the added ones
     ranked, _ = similarity.nearest(rows, STARTS, candidates)
     starts = styles.embedding.weight.detach()[torch.from_numpy(ranked)]  # (E, K, style_dim)
     read = read or (lambda episode: _columns(new.episode(episode), preprocessor, config))
     encoded, errors, nearest_errors, began = [], [], [], []
+    projected = None
+    if styles.embedded is not None and config.has_fixed_styles:
+        projected = styles.embedded.of(config.manner.of(added))
     parts = [slice(i, i + CHUNK) for i in range(0, len(chosen), CHUNK)]
     with Progress(total=len(parts) * ENCODING_STEPS, desc="Encoding", unit="step") as bar:
         for part in parts:
             frames = [read(episode) for episode in chosen[part]]
-            found = encode_styles(policy.imitation, frames, starts[part], ENCODING_STEPS, bar.update)
+            own, n_steps = (starts[part], ENCODING_STEPS) if projected is None else (projected[part, None], 0)
+            found = encode_styles(policy.imitation, frames, own, n_steps, bar.update)
             began += [_first_observation(f, config.observation_keys) for f in frames]
             encoded.append(found[0])
             errors.append(found[1])

@@ -144,7 +144,8 @@ class StackedPolicies:
         with torch.no_grad():
             for k, policy in enumerate(self.policies):
                 for name, parameter in policy.named_parameters():
-                    parameter.copy_(self._blocks[name].stacked[k])
+                    if name in self._blocks:  # else it is not trained
+                        parameter.copy_(self._blocks[name].stacked[k])
 
     def optimizer_state(self, k: int) -> dict[str, Any]:
         """State of policy k's optimizer, as `Optimizer.state_dict` of a single one."""

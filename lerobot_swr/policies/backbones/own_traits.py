@@ -14,6 +14,8 @@ from lerobot_swr.policies.processor_swr import Pipelines, vector_pipelines
 if TYPE_CHECKING:
     from lerobot_swr.policies.configuration_swr import BCConfig
 
+STYLE_LR_SCALE = 5.0  # in units of the network's rate: a style learns from its own episode alone
+
 
 class OwnTraits(Traits):
     """Of this package's own backbones: the present numbers side by side, fused Adam."""
@@ -27,7 +29,8 @@ class OwnTraits(Traits):
 
     def style_lr(self, config: "BCConfig") -> float:
         """In units of the network's."""
-        return config.optimizer_lr * getattr(config, "style_lr_scale", 1.0)
+        scale = getattr(config, "style_lr_scale", None)
+        return config.optimizer_lr * (STYLE_LR_SCALE if scale is None else scale)
 
     def optimizer(self, config: "BCConfig") -> OptimizerConfig:
         """Fused Adam."""

@@ -84,7 +84,7 @@ class PolicyTraits(Traits):
                     f"--policy.backbone.{key}, where it has that option"
                 )
         scale = getattr(config, "style_lr_scale", None)
-        if scale != getattr(type(config), "style_lr_scale", None):
+        if scale not in (None, 0):
             raise ValueError(
                 f"policy.style_lr_scale={scale}: over the backbone {self.backbone.type!r} the styles' "
                 f"learning rate is absolute; give --policy.style_lr (default {STYLE_LR:g})"
