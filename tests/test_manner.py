@@ -53,10 +53,13 @@ def test_things_are_found_by_the_names_of_dimensions():
     poses = find_poses(
         {
             STATE: ["gripper", "tool_x", "tool_y", "tool_z", "desired_x"],
-            SCENE: ["cube.qx", "cube.qy", "cube.qz", "cube.qw", "cube.x", "cube.y", "cube.z", "goal/x", "goal/y",
-                    "goal/theta", "can_pos_x", "can_pos_y", "can_quat_w", "can_quat_x", "can_quat_y", "can_quat_z"],
+            SCENE: [
+                *("cube.qx", "cube.qy", "cube.qz", "cube.qw", "cube.x", "cube.y", "cube.z"),
+                *("goal/x", "goal/y", "goal/theta", "can_pos_x", "can_pos_y"),
+                *("can_quat_w", "can_quat_x", "can_quat_y", "can_quat_z"),
+            ],
         }
-    )  # fmt: skip
+    )
     assert set(poses) == {"tool", "cube", "goal", "can"}
     assert hand_of(poses) == "tool"
     assert poses["cube"].parts["qw"] == 3

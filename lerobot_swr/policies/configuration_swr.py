@@ -171,7 +171,7 @@ class BCConfig(StateConfig):
     @property
     def looks_for_things(self) -> bool:
         """Whether an option needs the names of the observation's dimensions."""
-        return False
+        return bool(getattr(self.backbone, "looks_for_things", False))
 
 
 @PreTrainedConfig.register_subclass("zbc")
@@ -192,9 +192,9 @@ class ZBCConfig(BCConfig):
     # Standard deviation of the styles' normal initialisation. The paper's code leaves PyTorch's 1.0, which
     # needs several times more steps.
     style_init_scale: float = 0.1
-    # Learning rate of the styles, in units of optimizer_lr; null takes 5 for mlp, as a style learns from its own
-    # episode alone and with the paper's 1 lags behind the network, and 0 for style_init=similarity, whose
-    # styles then stay as they are.
+    # Learning rate of the styles, in units of optimizer_lr; null takes 5 for mlp, as a style learns from its
+    # own episode alone and with the paper's 1 lags behind the network, and 0 for style_init=similarity,
+    # whose styles then stay as they are.
     style_lr_scale: float | None = None
     # Learning rate of the styles; null takes style_lr_scale times optimizer_lr for mlp, 0.005 for other
     # backbones, whose presets range from 1e-5 to 1e-3. Weight decay is 0 on styles.

@@ -70,6 +70,8 @@ class StoredStyles(CheckedLoading):
         if self.correct is not None and self.data is None:
             style_checkpoints.check_corrective(cast(ZBCConfig, self.config).corrective, state)
         state = style_checkpoints.with_own_draws(cast(nn.Module, self), state, self.data)
+        if self.data is not None:
+            state = {**state, **{f"backbone.{key}": value for key, value in self.backbone.units.items()}}
         if self.data is not None and self.relative is not None:  # computed from the dataset
             own = self.relative.state_dict().items()
             state = {**state, **{f"relative.{key}": value for key, value in own}}

@@ -74,10 +74,12 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if dataset_meta is not None:
             self.data = data = TrainingData.read(config, dataset_meta)
             self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
+            config.traits.adopt(config, data.trajectories.columns, data.trajectories.lengths)
         style_dim = config.style_dim if isinstance(config, ZBCConfig) else 0
         stats = kwargs.get("dataset_stats") if dataset_meta is None else dataset_meta.stats
         self.backbone = config.traits.make(config, style_dim, stats, dataset_meta)
         if self.data is not None:
+            self.backbone.fit(self.data.trajectories.columns, self.data.normalize)
             config.num_episodes = len(self.data.trajectories)
             config.dataset_fingerprint = self.data.fingerprint
         self.has_styles = isinstance(config, ZBCConfig)

@@ -225,6 +225,14 @@ class TrainingData:
         frames = self._prepared(self.trajectories.columns, self.trajectories.starts)
         return torch.cat([frames[key] for key in self.config.observation_keys], dim=1)
 
+    def normalize(self, features: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Features of numbers (F, d), raw and as the policy sees them; not all need be given."""
+        dimensions = self.config.dimensions
+        rows = len(next(iter(features.values())))
+        blank = {key: torch.zeros(rows, d) for key, d in dimensions.items()}
+        found = vector_pipelines(self.config, self.meta.stats)[0]({**blank, **features})
+        return {key: found[key] for key in features}
+
     def frames(self, episode: int, rows: np.ndarray) -> Frames:
         """Some frames of an episode, as batches bring them."""
         return self._source.frames(episode, rows)

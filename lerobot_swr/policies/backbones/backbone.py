@@ -1,8 +1,10 @@
 """The contract between a style policy and what it learns actions with."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
@@ -20,6 +22,19 @@ class Backbone(nn.Module, ABC):
     def __init__(self) -> None:
         super().__init__()
         self.numbers: dict[str, float] = {}
+
+    def fit(self, columns: Mapping[str, np.ndarray], normalize: Callable[[dict], dict]) -> None:
+        """Take what is needed of the training dataset before training begins; nothing, by default.
+
+        Args:
+            columns: Feature name to raw (F, d).
+            normalize: Normalises such features, given as tensors.
+        """
+
+    @property
+    def units(self) -> dict[str, Tensor]:
+        """Those of its buffers, by name, that say how the dataset at hand is normalised."""
+        return {}
 
     @abstractmethod
     def loss(

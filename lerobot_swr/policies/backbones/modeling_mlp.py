@@ -3,10 +3,13 @@
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
+import numpy as np
 import torch
+from lerobot.utils.constants import ACTION
 from torch import Tensor, nn
 
 from lerobot_swr.policies.backbones.backbone import Backbone, squared_errors, weighted_mean
+from lerobot_swr.policies.backbones.objects import FITTED, Normalize, ObjectActions, ObjectEncoder
 
 
 class ObservationEncoder(nn.Module):
@@ -61,6 +64,8 @@ class MLPBackbone(Backbone):
         hidden_dim: Width of every hidden layer.
         num_hidden: Number of hidden layers.
         residual: Whether hidden layers are residual.
+        encoder: What features the network sees of observations; by default these side by side.
+        actions: What makes normalised actions of its outputs; by default these are the actions.
     """
 
     def __init__(
@@ -71,10 +76,14 @@ class MLPBackbone(Backbone):
         hidden_dim: int,
         num_hidden: int,
         residual: bool,
+        encoder: ObjectEncoder | None = None,
+        actions: ObjectActions | None = None,
     ):
         super().__init__()
-        self.encoder = ObservationEncoder(list(observations))
-        self.trunk = Trunk(sum(observations.values()) + style_dim, hidden_dim, num_hidden, residual)
+        self.encoder = ObservationEncoder(list(observations)) if encoder is None else encoder
+        self.actions = actions
+        features = sum(observations.values()) if encoder is None else encoder.dim
+        self.trunk = Trunk(features + style_dim, hidden_dim, num_hidden, residual)
         self.head = nn.Linear(hidden_dim, action_dim)
 
     def forward(self, batch: dict[str, Tensor], style: Tensor | None = None) -> Tensor:
@@ -82,7 +91,29 @@ class MLPBackbone(Backbone):
         features = self.encoder(batch)
         if style is not None:
             features = torch.cat([features, style], dim=-1)
-        return self.head(self.trunk(features))
+        outputs = self.head(self.trunk(features))
+        if self.actions is None or not isinstance(self.encoder, ObjectEncoder):
+            return outputs
+        scene = self.encoder.scene
+        return self.actions(outputs, scene, scene.raw(batch))
+
+    def fit(self, columns: Mapping[str, np.ndarray], normalize: Normalize) -> None:
+        """Let what looks at things know the dataset's units; see `Backbone.fit`."""
+        if self.actions is None or not isinstance(self.encoder, ObjectEncoder):
+            return
+        scene, count = self.encoder.scene, len(columns[ACTION])
+        rows = np.random.default_rng(0).permutation(count)[:FITTED]
+        frames = {key: torch.from_numpy(columns[key][rows]).float() for key in (*scene.keys, ACTION)}
+        scene.fit(normalize)
+        self.encoder.fit(frames)
+        self.actions.fit(scene, frames, frames[ACTION], normalize)
+
+    @property
+    def units(self) -> dict[str, Tensor]:
+        """How observations and actions are normalised, see `Backbone.units`."""
+        names = ("actions.gain", "actions.shift")
+        own = dict(self.named_buffers())
+        return {name: value for name, value in own.items() if name in names or ".scene." in name}
 
     def loss(self, batch: dict[str, Tensor], style: Tensor | None, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Weighted squared error of the action, see `Backbone.loss`."""

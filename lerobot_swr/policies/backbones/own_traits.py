@@ -1,7 +1,9 @@
 """What a style policy takes over from this package's own backbones."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 
 from lerobot_swr.dataset_statistics import Statistics
@@ -26,6 +28,10 @@ class OwnTraits(Traits):
 
     def settle(self, config: "BCConfig") -> None:
         """Nothing."""
+
+    def adopt(self, config: "BCConfig", columns: Mapping[str, np.ndarray], lengths: np.ndarray) -> None:
+        """What the backbone's own options ask for."""
+        self._backbone.adopt(columns, lengths, config.dimension_names or {})
 
     def style_lr(self, config: "BCConfig") -> float:
         """In units of the network's."""
@@ -54,4 +60,5 @@ class OwnTraits(Traits):
     ) -> Backbone:
         """Of the dimensions of the low-dimensional observations."""
         observations = {key: config.dimensions[key] for key in config.observation_keys}
-        return self._backbone.make(observations, style_dim, config.action_dim)
+        names = config.dimension_names or {}
+        return self._backbone.make_named(observations, style_dim, config.action_dim, names)

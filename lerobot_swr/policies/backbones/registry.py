@@ -11,8 +11,10 @@ from typing import Any, ClassVar
 
 import draccus
 import lerobot.policies  # noqa: F401  (registers LeRobot's policies)
+import numpy as np
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.object_poses import Names
 from lerobot_swr.policies.backbones.backbone import Backbone
 
 DEFAULT = "mlp"
@@ -69,6 +71,29 @@ class BackboneConfig(draccus.ChoiceRegistry):
     def type(self) -> str:
         """The name by which the backbone is chosen."""
         return self.get_choice_name(self.__class__)
+
+    @property
+    def looks_for_things(self) -> bool:
+        """Whether it needs the names of the observations' dimensions."""
+        return False
+
+    def adopt(self, columns: Mapping[str, np.ndarray], lengths: np.ndarray, names: Names) -> None:
+        """Fill in the options that the training dataset decides; none, by default.
+
+        Args:
+            columns: Feature name to raw (F, d), episodes one after the other.
+            lengths: (N,) frames per episode.
+            names: Of the features' dimensions.
+
+        Raises:
+            ValueError: If the dataset lacks what the options ask for.
+        """
+
+    def make_named(
+        self, observations: Mapping[str, int], style_dim: int, action_dim: int, names: Names
+    ) -> Backbone:
+        """As `make`, for a backbone that also looks at the names of features' dimensions."""
+        return self.make(observations, style_dim, action_dim)
 
     @abstractmethod
     def make(self, observations: Mapping[str, int], style_dim: int, action_dim: int) -> Backbone:

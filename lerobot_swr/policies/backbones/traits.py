@@ -1,8 +1,10 @@
 """What a style policy takes over from its backbone: inputs, windows, processors, optimizer, network."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 
 from lerobot_swr.dataset_statistics import Statistics
@@ -33,6 +35,20 @@ class Traits(ABC):
 
         Raises:
             ValueError: Naming the offending key and value.
+        """
+
+    def adopt(  # noqa: B027 (most have none)
+        self, config: "BCConfig", columns: Mapping[str, np.ndarray], lengths: np.ndarray
+    ) -> None:
+        """Fill in options that the training dataset decides; none, by default.
+
+        Args:
+            config: The style policy's configuration.
+            columns: Feature name to raw (F, d), episodes one after the other.
+            lengths: (N,) frames per episode.
+
+        Raises:
+            ValueError: If the dataset lacks what the options ask for.
         """
 
     @abstractmethod
