@@ -8,8 +8,10 @@ import torch
 from conftest import save_checkpoint
 from lerobot.configs import PreTrainedConfig
 
+from lerobot_swr.policies.configuration_swr import WZBCConfig
 from lerobot_swr.policies.modeling_swr import ZBCPolicy
-from lerobot_swr.scene_variation import scene_variation
+from lerobot_swr.policies.scene_defaults import adopt_scene_defaults
+from lerobot_swr.scene_variation import SceneVariation, scene_variation
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.request import StyleRequest
 from lerobot_swr.styles.selection import StyleSelection
@@ -132,3 +134,21 @@ def test_a_scene_varies_where_starts_differ_by_more_than_noise():
     assert found.vary
     assert "1 of 4 dimensions of the observation (goal)" in found.describe()
     assert not scene_variation(frames[:, 1:], lengths).vary
+
+
+@pytest.mark.parametrize(
+    ("vary", "dim", "sampling", "beta"), [(True, 10, "scene", 2.0), (False, 10, "uniform", 10.0)]
+)
+def test_options_that_are_left_open_are_chosen_by_how_much_scenes_vary(vary, dim, sampling, beta, caplog):
+    """One sentence says so; what is given stays, and is commented."""
+    variation = SceneVariation(np.array([0.9 if vary else 0.0, 0.0]), ("goal", "x"))
+    config = WZBCConfig(style_dim=None, style_sampling=None, beta=None)
+    with caplog.at_level("INFO"):
+        adopt_scene_defaults(config, variation)
+    assert (config.style_dim, config.style_sampling, config.beta) == (dim, sampling, beta)
+    (message,) = caplog.messages
+    assert f"--policy.style_sampling={sampling}" in message
+    given = WZBCConfig(style_dim=7, style_sampling="stratified", beta=5.0)
+    adopt_scene_defaults(given, variation)
+    assert (given.style_dim, given.style_sampling, given.beta) == (7, "stratified", 5.0)
+    assert ("Recommended: --policy.style_sampling=scene" in caplog.messages[-1]) == vary

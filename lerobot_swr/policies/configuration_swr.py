@@ -182,8 +182,8 @@ class ZBCConfig(BCConfig):
     takes_style: ClassVar[bool] = True
 
     # --- Styles ---
-    # Dimension of a style z.
-    style_dim: int = 10
+    # Dimension of a style z; null chooses by how much scenes vary.
+    style_dim: int | None = 10
     # Where styles start: "normal" (at random) or "similarity" (principal coordinates of what similarity
     # compares, the first with a standard deviation of 1). For scenes that vary, see docs/scenes.md.
     style_init: str = "normal"
@@ -231,8 +231,9 @@ class ZBCConfig(BCConfig):
 
     # --- Inference: which styles are drawn, one per episode of the environment ---
     # "uniform" (with replacement, the paper), "stratified" (each style once before any is used again),
-    # "fixed" (in the given order) or "scene" (one whose demonstration began most like the rollout).
-    style_sampling: str = "uniform"
+    # "fixed" (in the given order) or "scene" (one whose demonstration began most like the rollout); null
+    # chooses by how much scenes vary.
+    style_sampling: str | None = "uniform"
     # Only the styles of these episodes of the training dataset; null allows all that were trained.
     style_episodes: list[int] | None = None
     # Only the styles of demonstrations that match a filter, e.g. "70 <= length <= 80 and behavior == '6410'";
@@ -278,7 +279,7 @@ class ZBCConfig(BCConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
-        if self.style_dim < 1:
+        if self.style_dim is not None and self.style_dim < 1:
             raise ValueError(f"style_dim={self.style_dim}: expected at least 1")
         if not self.style_init_scale >= 0:
             raise ValueError(f"style_init_scale={self.style_init_scale}: expected a number >= 0")
@@ -286,7 +287,8 @@ class ZBCConfig(BCConfig):
         if self.style_lr is not None and not self.style_lr > 0:
             raise ValueError(f"style_lr={self.style_lr}: expected a number > 0")
         check_style_place(self.style_key)
-        check_style_sampling(self.style_sampling)
+        if self.style_sampling is not None:
+            check_style_sampling(self.style_sampling)
         if self.corrective not in ("none", "noise", "demos"):
             raise ValueError(f"corrective={self.corrective!r}: expected 'none', 'noise' or 'demos'")
         if not self.corrective_scale > 0:
@@ -393,8 +395,8 @@ class WZBCConfig(ZBCConfig):
 
     # --- Similarity weighted regression ---
     # Inverse temperature of the weights exp(-beta * nu): 0 lets every demonstration teach every style, large
-    # values only (near-)equal ones.
-    beta: float = 10.0
+    # values only (near-)equal ones. null chooses by how much scenes vary.
+    beta: float | None = 10.0
     # Probability with which algorithm 1 relabels a frame with another demonstration's style; 0 is ZBC.
     p: float = 0.8
     # Draw pairs by their share in the expected loss ("weighted"), or partners uniformly with the loss
@@ -411,7 +413,8 @@ class WZBCConfig(ZBCConfig):
             ValueError: Naming the offending key and value.
         """
         super().__post_init__()
-        check_beta(self.beta)
+        if self.beta is not None:
+            check_beta(self.beta)
         check_probability(self.p)
         check_partner_sampling(self.partner_sampling)
         check_normalization(self.similarity_normalization)

@@ -15,6 +15,7 @@ from lerobot_swr.policies.dynamics import adopt_dynamics, make_relative_actions
 from lerobot_swr.policies.lessons import Balance, Blur, Correct, Lesson, LessonStep, Relabel, logged
 from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
+from lerobot_swr.policies.scene_defaults import adopt_scene_defaults
 from lerobot_swr.policies.stored_styles import StoredStyles
 from lerobot_swr.policies.training_data import (
     TrainingData,
@@ -74,8 +75,10 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if dataset_meta is not None:
             self.data = data = TrainingData.read(config, dataset_meta)
             self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
+            if isinstance(config, ZBCConfig):
+                adopt_scene_defaults(config, data.scene_variation)
             config.traits.adopt(config, data.trajectories.columns, data.trajectories.lengths)
-        style_dim = config.style_dim if isinstance(config, ZBCConfig) else 0
+        style_dim = (config.style_dim or 0) if isinstance(config, ZBCConfig) else 0
         stats = kwargs.get("dataset_stats") if dataset_meta is None else dataset_meta.stats
         self.backbone = config.traits.make(config, style_dim, stats, dataset_meta)
         if self.data is not None:
@@ -98,6 +101,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
                 f"policy {self.name!r} keeps one style per episode of its dataset: create it with a dataset "
                 "(dataset_meta) or from a checkpoint (num_episodes)"
             )
+        assert config.style_dim is not None
         data, dynamics = self.data, None
         if data is not None:
             config.num_added_styles = 0 if data.is_new else config.num_added_styles
@@ -106,7 +110,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             config.num_episodes + config.num_added_styles,
             config.style_dim,
             config.style_init_scale,
-            config.style_sampling,  # type: ignore[arg-type]
+            config.style_sampling or "uniform",  # type: ignore[arg-type]
             config.style_selection,
             config.observation_dim,
             config.near_scenes,

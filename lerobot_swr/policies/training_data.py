@@ -261,6 +261,7 @@ def make_sampler(config: WZBCConfig, data: TrainingData) -> PartnerSampler:
             f"dataset.root={str(data.root)!r}: a single episode to train on; wzbc compares "
             "episodes and needs at least 2: record more, leave more in, or use --policy.type=zbc"
         )
+    assert config.beta is not None
     return PartnerSampler(
         data.similarity,
         np.array(data.run.episodes),
@@ -284,6 +285,7 @@ def make_embedding(config: ZBCConfig, data: TrainingData | None) -> MannerEmbedd
         config.embedded_shape = (int(data.compared.lengths[trained].max()), width)
     if config.embedded_shape is None:
         raise ValueError("style_init='similarity': this takes effect when a policy is created with a dataset")
+    assert config.style_dim is not None
     embedding = MannerEmbedding(config.style_dim, *config.embedded_shape)
     if data is not None:
         embedding.fit(data.compared.joined(columns), data.compared.lengths, trained)
