@@ -91,6 +91,8 @@ def run_counterfactual(
 ) -> tuple[CounterfactualResult, list[Rollout]]:
     """Request every demonstrated behaviour from the same starts.
 
+    Of a policy that draws by scene, one of a behaviour's styles is requested by scene.
+
     Args:
         checkpoint: A style policy; only styles that its flags allow are requested.
         trajectories: Its training dataset.
@@ -111,7 +113,11 @@ def run_counterfactual(
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     allowed = [i for i in styles.allowed().tolist() if i < len(demonstrated)]
     plan = plan_requests(allowed, demonstrated, per_behavior, seed)
-    with styles.requested(StyleRequest([episode for _, episode in plan])):
+    request = StyleRequest([episode for _, episode in plan])
+    if styles.drawing.sampling == "scene":  # of the behaviour's styles the one that suits the scene
+        shown_by = {la: [i for i in allowed if demonstrated[i] == la] for la in set(demonstrated)}
+        request = StyleRequest(choices=[shown_by[demonstrated[episode]] for _, episode in plan])
+    with styles.requested(request):
         rollouts = run_rollouts(
             checkpoint, env_cfg, rule, len(plan), batch_size, seed, [seed + start for start, _ in plan]
         )
