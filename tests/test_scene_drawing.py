@@ -142,13 +142,15 @@ def test_a_scene_varies_where_starts_differ_by_more_than_noise():
 def test_options_that_are_left_open_are_chosen_by_how_much_scenes_vary(vary, dim, sampling, beta, caplog):
     """One sentence says so; what is given stays, and is commented."""
     variation = SceneVariation(np.array([0.9 if vary else 0.0, 0.0]), ("goal", "x"))
-    config = WZBCConfig(style_dim=None, style_sampling=None, beta=None)
+    config = WZBCConfig(style_dim=None, style_sampling=None, beta=None, device="cpu")
+    caplog.clear()
     with caplog.at_level("INFO"):
         adopt_scene_defaults(config, variation)
     assert (config.style_dim, config.style_sampling, config.beta) == (dim, sampling, beta)
     (message,) = caplog.messages
     assert f"--policy.style_sampling={sampling}" in message
-    given = WZBCConfig(style_dim=7, style_sampling="stratified", beta=5.0)
-    adopt_scene_defaults(given, variation)
+    given = WZBCConfig(style_dim=7, style_sampling="stratified", beta=5.0, device="cpu")
+    with caplog.at_level("INFO"):
+        adopt_scene_defaults(given, variation)
     assert (given.style_dim, given.style_sampling, given.beta) == (7, "stratified", 5.0)
     assert ("Recommended: --policy.style_sampling=scene" in caplog.messages[-1]) == vary

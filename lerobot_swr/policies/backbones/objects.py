@@ -123,7 +123,7 @@ class ObjectEncoder(nn.Module):
     def fit(self, raw: Mapping[str, Tensor]) -> None:
         """Standardise by frames (F, d_k) of the training dataset."""
         for relations, kind in zip(self.scene.relations(raw), ("offsets", "rotations"), strict=True):
-            spread = relations.std(dim=0, correction=0)
+            spread = (relations - relations.mean(dim=0)).square().mean(dim=0).sqrt()
             moves = spread > 1e-6 * relations.abs().amax(dim=0).clamp_min(1e-6)
             self.get_buffer(f"mean_of_{kind}").copy_(relations.mean(dim=0))
             self.get_buffer(f"gain_of_{kind}").copy_(torch.where(moves, 1 / spread.clamp_min(1e-12), 0))
