@@ -5,6 +5,7 @@ import pytest
 import torch
 from conftest import save_checkpoint
 from lerobot.configs import PreTrainedConfig
+from lerobot.policies import make_pre_post_processors
 from scipy.spatial.distance import cdist
 
 from lerobot_swr.object_poses import find_poses, hand_of
@@ -12,6 +13,7 @@ from lerobot_swr.policies.modeling_swr import ZBCPolicy
 from lerobot_swr.similarity import Manner, similarity_by
 from lerobot_swr.similarity.manner import hand_path
 from lerobot_swr.styles.embedding import MannerEmbedding
+from lerobot_swr.styles.extension import add_demonstrations
 from lerobot_swr.trajectories import Trajectories
 
 STATE, SCENE = "observation.state", "observation.environment_state"
@@ -181,6 +183,19 @@ def test_styles_may_be_trained_on_from_the_similarity(make_tiny_policy):
     trained = {id(p) for group in policy.get_optim_params() for p in group["params"]}
     assert id(policy.styles.embedding.weight) in trained
     assert policy.blur is None
+
+
+def test_added_demonstrations_are_projected_at_once(make_tiny_policy, small_maze_meta):
+    """The style of an episode that was left out is its place among the others, whatever the network."""
+    policy = make_tiny_policy("zbc", episodes=[0, 1, 2, 3], style_init="similarity", style_dim=2)
+    projected = policy.styles.embedded.of(policy.data.compared)
+    preprocessor, _ = make_pre_post_processors(policy.config, dataset_stats=small_maze_meta.stats)
+    with torch.no_grad():
+        policy.styles.embedding.weight[5] = 7.0  # as if nobody knew
+    added = add_demonstrations(policy, preprocessor, policy.trajectories, policy.trajectories, [5])
+    assert added.episodes == [5]
+    torch.testing.assert_close(policy.styles.embedding.weight[5], projected[5])
+    assert policy.styles.allowed().tolist() == [0, 1, 2, 3, 5]
 
 
 @pytest.mark.parametrize(
