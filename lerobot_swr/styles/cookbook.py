@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -12,7 +11,7 @@ from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling, one_of_each
 from lerobot_swr.styles.embedding import MannerEmbedding
 from lerobot_swr.styles.request import StyleRequest, Styles, as_request
 from lerobot_swr.styles.scenes import Scenes
-from lerobot_swr.styles.selection import StyleSelection
+from lerobot_swr.styles.selection import ResolvedSelection, StyleSelection
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import Trajectories
 
@@ -71,7 +70,7 @@ class StyleCookbook(nn.Module):
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
         self._vectors: Tensor | None = None
-        self._resolved: _Resolved | None = None
+        self._resolved: ResolvedSelection | None = None
         self._names: list[str | None] = []
         self._change = False
         self.asked: StyleRequest | StyleSelection | None = None
@@ -213,7 +212,7 @@ class StyleCookbook(nn.Module):
         selection = self.asked if isinstance(self.asked, StyleSelection) else self.selection
         known = self._resolved
         if known is None or not known.holds(selection, self.table, self.trained):
-            self._resolved = known = _Resolved(selection, self.table, self.trained.clone(), {})
+            self._resolved = known = ResolvedSelection(selection, self.table, self.trained.clone(), {})
         if name not in known.episodes:
             episodes = selection.resolve(self._is_trained(), self.table, name)
             known.episodes[name] = torch.tensor(episodes, device=self.trained.device)
@@ -331,17 +330,3 @@ class StyleCookbook(nn.Module):
             allowed = torch.tensor(asked.choices[choice], device=device)
             drawn[whose] = self._draw_among(allowed, whose, scene, f"choice {choice}")
         return drawn, None
-
-
-@dataclass(frozen=True, eq=False)
-class _Resolved:
-    """Which episodes were allowed by what, for it takes long to find that out of very many."""
-
-    selection: StyleSelection
-    table: StyleTable | None
-    trained: Tensor
-    episodes: dict[str | None, Tensor]
-
-    def holds(self, selection: StyleSelection, table: StyleTable | None, trained: Tensor) -> bool:
-        same = self.selection is selection and self.table is table and self.trained.shape == trained.shape
-        return same and self.trained.device == trained.device and torch.equal(self.trained, trained)

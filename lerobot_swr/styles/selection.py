@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lerobot_swr.styles.filters import describe_columns, parse_filter
 from lerobot_swr.styles.table import MAX_NEIGHBOURS, StyleTable
@@ -114,3 +116,25 @@ class StyleSelection:
                 key: [values[i] for i in np.flatnonzero(trained)] for key, values in table.columns.items()
             }
         return f"{given}: no style is left to draw; the demonstrations have: {describe_columns(known)}"
+
+
+@dataclass(frozen=True, eq=False)
+class ResolvedSelection:
+    """Which episodes a selection allowed, for it takes long to find that out of very many.
+
+    Attributes:
+        selection: The selection.
+        table: The table by which it was resolved.
+        trained: (N,) which episodes had a style.
+        episodes: Name of a further filter, None for none, to (M,) int64 episodes.
+    """
+
+    selection: StyleSelection
+    table: StyleTable | None
+    trained: Tensor
+    episodes: dict[str | None, Tensor]
+
+    def holds(self, selection: StyleSelection, table: StyleTable | None, trained: Tensor) -> bool:
+        """Whether it is what the selection would give now."""
+        same = self.selection is selection and self.table is table and self.trained.shape == trained.shape
+        return same and self.trained.device == trained.device and torch.equal(self.trained, trained)
