@@ -106,6 +106,11 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if data is not None:
             config.num_added_styles = 0 if data.is_new else config.num_added_styles
             dynamics = adopt_dynamics(config, data)
+        if config.action_targets is not None and getattr(config.backbone, "looks_for_things", False):
+            raise ValueError(
+                "backbone.encoder='objects' says by itself what actions are relative to: give "
+                "--policy.corrective_relative=false"
+            )
         self.styles = StyleCookbook(
             config.num_episodes + config.num_added_styles,
             config.style_dim,
