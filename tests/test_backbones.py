@@ -90,7 +90,8 @@ def test_a_checkpoint_knows_its_backbone(make_tiny_policy, small_maze_meta, tmp_
     """Type and options are in config.json, and a flag can change what is none of the network's business."""
     folder = save_checkpoint(make_tiny_policy("zbc", backbone=MLPConfig(24, 2)), small_maze_meta, tmp_path)
     stored = json.loads((folder / "config.json").read_text())["backbone"]
-    assert stored == {"type": "mlp", "hidden_dim": 24, "num_hidden": 2, "residual": True}
+    plain = {"encoder": "plain", "frame": None, "multiscale": True}
+    assert stored == {"type": "mlp", "hidden_dim": 24, "num_hidden": 2, "residual": True, **plain}
     config = PreTrainedConfig.from_pretrained(folder, cli_overrides=["--style_sampling=stratified"])
     assert config.backbone == MLPConfig(24, 2)
     assert config.style_sampling == "stratified"
