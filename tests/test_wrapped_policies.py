@@ -203,9 +203,9 @@ def test_a_rollout_with_more_environments_needs_a_reset(make_styled, small_maze)
     assert policy.select_action(observed(policy, small_maze, size=3)).shape == (3, 2)
 
 
-@every_kind
+@pytest.mark.parametrize("kind", ["act", "smolvla"])
 def test_it_is_pushed_to_the_hub_with_its_table(make_styled, data_of, kind):
-    """Everything that LeRobot uploads is there, offline."""
+    """Everything that LeRobot uploads is there, and what this package puts beside it; offline."""
     policy = make_styled("zbc", kind, data_of(kind), repo_id="me/styled")
     cfg = SimpleNamespace(dataset=SimpleNamespace(repo_id="me/data"), save_pretrained=lambda path: None)
     names = []
@@ -226,6 +226,7 @@ def test_it_is_pushed_to_the_hub_with_its_table(make_styled, data_of, kind):
     with (
         patch.object(pretrained, "HfApi", Api),
         patch.object(type(policy.styles.table), "upload", lambda *args: names.append("table")),
+        patch("huggingface_hub.HfApi.upload_file", lambda api, path_in_repo, **_: names.append(path_in_repo)),
         patch.object(type(policy), "generate_model_card", lambda *args, **options: card),
     ):
         policy.push_model_to_hub(cfg)
