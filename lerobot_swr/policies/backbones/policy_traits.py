@@ -78,7 +78,9 @@ class PolicyTraits(Traits):
             field, value = unset[key], getattr(config, key)
             default = field.default_factory() if callable(field.default_factory) else field.default
             told = getattr(self.backbone, key, None)
-            if value not in (default, told) and config.num_episodes is None:
+            if key == "normalization_mapping" and config.num_episodes is not None:
+                continue  # that of the backbone when the checkpoint was made
+            if value not in (default, told):
                 raise ValueError(
                     f"policy.{key}={value}: belongs to the backbone {self.backbone.type!r}; give "
                     f"--policy.backbone.{key}, where it has that option"
