@@ -179,7 +179,8 @@ def _evaluations(results: Sequence[ResultFile], pictures: Sequence[str]) -> list
 
 
 def _use(policy: Any, name: str) -> list[str]:
-    lines = ["", "## Use", "", *code(f"lerobot-rollout --strategy.type=base --policy.path={name} --robot.type=...")]
+    rollout = f"lerobot-rollout --strategy.type=base --policy.path={name} --robot.type=..."
+    lines = ["", "## Use", "", *code(rollout)]
     known, episodes = _table(policy), _trained(policy)
     if known is None or not episodes:
         return lines
