@@ -46,7 +46,11 @@ def main() -> None:
     if "RANK" in os.environ:
         work(options.keep)
         return
-    hangs = sum(_hangs(options.keep) for _ in range(options.runs))
+    hangs = 0
+    for run in range(options.runs):
+        start = time.monotonic()
+        hangs += _hangs(options.keep)
+        print(f"pair {run + 1}: {time.monotonic() - start:.1f} s, {hangs} hung so far", flush=True)
     print(f"torch {torch.__version__}: {hangs} of {options.runs} pairs hang at their exit")
 
 
