@@ -59,10 +59,10 @@ class DemoCommand:
     # Only these of medium_maze-one_side, medium_maze-only_forward and d3il_avoiding; null takes all for which
     # the packages are installed.
     datasets: list[str] | None = None
-    # Training steps of each policy; these fit ten minutes on two cores.
+    # Training steps of each policy: of zbc and wzbc the paper's, as in the results of the README.
     bc_steps: int = 20_000
-    zbc_steps: int = 60_000
-    wzbc_steps: int = 80_000
+    zbc_steps: int = 100_000
+    wzbc_steps: int = 100_000
     # Rollouts per evaluation.
     n_episodes: int = 100
     # Trainings that run at once.
