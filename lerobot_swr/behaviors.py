@@ -6,6 +6,7 @@ this package carries its own rule; a user names another one as ``module:function
 
 import importlib
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ def dataset_behavior_rule(path: str | None, robot_type: str | None) -> BehaviorR
     """The rule that labels a dataset's demonstrations.
 
     Args:
-        path: ``module:function``; None takes the rule of this package's own datasets.
+        path: ``module:function`` or ``behaviors.json``; None takes the rule of this package's own datasets.
         robot_type: Of the dataset's metadata.
 
     Returns:
@@ -49,14 +50,22 @@ def dataset_behavior_rule(path: str | None, robot_type: str | None) -> BehaviorR
 
 
 def load_behavior_rule(path: str) -> BehaviorRule:
-    """Import a behaviour rule given as ``module:function``.
+    """A behaviour rule given as ``module:function``, or as the file that ``lerobot-swr-behaviors`` writes.
 
     Args:
-        path: Dotted module and function name, for example ``my_project.rules:which_side``.
+        path: Dotted module and function name, for example ``my_project.rules:which_side``; or a file
+            ``….json``.
 
     Raises:
-        ValueError: If the path has another form, or the module or the function does not exist.
+        FileNotFoundError: If there is no such file.
+        ValueError: If the path has another form, the module or the function does not exist, or the file
+            holds something else.
     """
+    if path.endswith(".json"):
+        # Clustering needs scikit-learn, which takes a while to import.
+        from lerobot_swr.discovery.rule import DiscoveredRule
+
+        return DiscoveredRule.load(Path(path))
     return load_function("behavior_rule", path)
 
 

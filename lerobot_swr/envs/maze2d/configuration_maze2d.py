@@ -149,8 +149,13 @@ class Maze2DEnvConfig(TaskEnvConfig):
         return int(reached.argmax()) if reached.any() else len(reached)
 
     def expected_behavior(self, requested: str, observations: Mapping[str, np.ndarray]) -> str:
-        """The requested checkpoints that lie ahead: a start beyond a wall leaves that wall's door out."""
+        """The requested checkpoints that lie ahead: a start beyond a wall leaves that wall's door out.
+
+        Labels of other rules, which are no checkpoints, are left as they are.
+        """
         layout = get_layout(self.task or "")
+        if not set(requested) <= {str(d.checkpoint) for wall in layout.walls for d in wall.doors} | {"0"}:
+            return requested
         y = observations[OBS_STATE][0, 1]
         ahead = {str(d.checkpoint) for wall in layout.walls if wall.y >= y for d in wall.doors} | {"0"}
         return "".join(checkpoint for checkpoint in requested if checkpoint in ahead)

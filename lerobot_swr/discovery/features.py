@@ -1,0 +1,293 @@
+"""What an episode is compared by: its path, standardised, with or without what its scene explains.
+
+A *scene* is what differs from episode to episode at the start and is not the person's choice. Where starts
+differ, paths are also looked at without the part that the first state predicts (a ridge regression), so that
+two episodes of the same manner in different scenes are alike.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from sklearn.linear_model import RidgeCV
+
+from lerobot_swr.behaviors import load_function
+from lerobot_swr.discovery.paths import walk, walk_all
+
+POINTS = 50
+MOVES = 0.02  # least spread within episodes of a dimension that counts as moving, relative to all frames'
+VARIES = 0.2  # least spread of first states in a dimension that is scene, relative to all frames'
+KEPT = 0.99  # share of the variance that the main directions hold
+MOST_DIRECTIONS = 10
+PENALTIES = np.logspace(-1, 4, 12)
+
+Episode = Mapping[str, np.ndarray]
+FeatureFunction = Callable[[Episode], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where the numbers come from.
+
+    Attributes:
+        keys: Features whose values side by side are the states, if there is no function.
+        function: ``module:function`` that maps an episode to (T', d) states or to a vector (d,); or None.
+    """
+
+    keys: tuple[str, ...]
+    function: str | None = None
+
+    def __post_init__(self) -> None:
+        """Import the function.
+
+        Raises:
+            ValueError: If there is none of that name.
+        """
+        if self.function is not None:
+            object.__setattr__(self, "_call", load_function("features", self.function))
+
+    def states(self, episode: Episode) -> np.ndarray:
+        """(T, d) states, or (1, d) for a vector, of an episode.
+
+        Raises:
+            ValueError: If the episode lacks a key, or the function fails or returns something else.
+        """
+        if self.function is None:
+            absent = [key for key in self.keys if key not in episode]
+            if absent:
+                raise ValueError(
+                    f"the behaviours were found by {', '.join(self.keys)}, but this episode has no "
+                    f"{', '.join(absent)} (it has {', '.join(episode)}); find them anew by what is there: "
+                    "lerobot-swr-behaviors --keys=[...]"
+                )
+            return np.concatenate([_two(episode[key]) for key in self.keys], axis=1, dtype=np.float64)
+        try:
+            value = np.asarray(self._call(episode), dtype=np.float64)  # type: ignore[attr-defined]
+        except Exception as error:  # whatever a user's function raises
+            raise ValueError(f"features={self.function!r} fails on an episode: {error!r}") from error
+        if value.ndim not in (1, 2) or not value.size or not np.isfinite(value).all():
+            raise ValueError(
+                f"features={self.function!r} returns an array of shape {value.shape}; expected finite "
+                "numbers of shape (T, d), a path, or (d,), one vector"
+            )
+        return value if value.ndim == 2 else value[None]
+
+
+def _two(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values).reshape(len(values), -1)
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Units in which all dimensions count alike.
+
+    Attributes:
+        source: Where the numbers come from.
+        centre: (d,) mean of the states.
+        spread: (d,) their standard deviation; 1 for constant dimensions.
+        moving: (m,) dimensions that change within episodes; the others tell scenes at most.
+        weights: (m,) of these in a path: a feature counts as much as another one, however wide it is.
+    """
+
+    source: Source
+    centre: np.ndarray
+    spread: np.ndarray
+    moving: np.ndarray
+    weights: np.ndarray
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """(T, d) standardised states.
+
+        Raises:
+            ValueError: If the states have other dimensions.
+        """
+        if states.shape[1] != len(self.centre):
+            what = self.source.function or ", ".join(self.source.keys)
+            raise ValueError(
+                f"the behaviours were found in {len(self.centre)} dimensions of {what}; this episode has "
+                f"{states.shape[1]}: give what was recorded like the dataset"
+            )
+        return (states - self.centre) / self.spread
+
+    def ways(self, standardised: np.ndarray) -> np.ndarray:
+        """(T, m) weighted moving dimensions of (T, d) standardised states."""
+        return standardised[:, self.moving] * self.weights
+
+
+@dataclass(frozen=True)
+class Paths:
+    """N episodes, standardised and resampled.
+
+    Attributes:
+        scaling: Their units.
+        paths: (N, P, m) of the moving dimensions; P is 1 for vectors.
+        firsts: (N, d) first states.
+    """
+
+    scaling: Scaling
+    paths: np.ndarray
+    firsts: np.ndarray
+
+    @property
+    def scene(self) -> np.ndarray:
+        """Dimensions of the first state that differ between episodes as scenes do."""
+        return (
+            np.flatnonzero(self.firsts.std(axis=0) > VARIES) if self.paths.shape[1] > 1 else np.array([], int)
+        )
+
+
+@dataclass(frozen=True)
+class Features:
+    """A fitted definition: maps an episode to a few numbers.
+
+    Attributes:
+        scaling: Units.
+        points: P, points of a path; 1 for vectors.
+        scene: Dimensions of the first state that are scene; none where it is not looked at.
+        slope: (scene, P·m) what a unit of them adds to the path.
+        offset: (P·m,) the mean path (of the scene at the centre).
+        directions: (k, P·m) orthonormal main directions of what is left.
+    """
+
+    scaling: Scaling
+    points: int
+    scene: np.ndarray
+    slope: np.ndarray
+    offset: np.ndarray
+    directions: np.ndarray
+
+    def residual(self, episode: Episode) -> np.ndarray:
+        """(P·m,) the path less the mean path of its scene."""
+        states = self.scaling(self.scaling.source.states(episode))
+        ways = self.scaling.ways(states)
+        path = ways[:1] if self.points == 1 else walk(ways, self.points)
+        return path.reshape(-1) - self.offset - states[0, self.scene] @ self.slope
+
+    def embed(self, episode: Episode) -> tuple[np.ndarray, float]:
+        """(k,) place along the main directions, and the distance from what these span."""
+        residual = self.residual(episode)
+        place = self.directions @ residual
+        return place, float(np.sqrt(max(residual @ residual - place @ place, 0.0)))
+
+    def to_json(self) -> dict[str, Any]:
+        """As ``behaviors.json`` holds it."""
+        return {
+            "keys": list(self.scaling.source.keys),
+            "function": self.scaling.source.function,
+            "points": self.points,
+            "moving": self.scaling.moving.tolist(),
+            "scene": self.scene.tolist(),
+            "centre": rounded(self.scaling.centre),
+            "spread": rounded(self.scaling.spread),
+            "weights": rounded(self.scaling.weights),
+            **{name: rounded(getattr(self, name)) for name in ("slope", "offset", "directions")},
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Self:
+        """Of what `to_json` gave."""
+        arrays = {name: np.array(data[name], float) for name in ("centre", "spread", "weights", "offset")}
+        width, scene = len(arrays["offset"]), np.array(data["scene"], int)
+        scaling = Scaling(
+            Source(tuple(data["keys"]), data["function"]),
+            arrays["centre"],
+            arrays["spread"],
+            np.array(data["moving"], int),
+            arrays["weights"],
+        )
+        return cls(
+            scaling,
+            int(data["points"]),
+            scene,
+            np.array(data["slope"], float).reshape(len(scene), width),
+            arrays["offset"],
+            np.array(data["directions"], float).reshape(-1, width),
+        )
+
+
+def measure_paths(
+    source: Source, states: Sequence[np.ndarray], kept: np.ndarray, widths: Sequence[int] = ()
+) -> Paths:
+    """Standardise and resample episodes.
+
+    Args:
+        source: Where they come from.
+        states: N arrays (T_i, d).
+        kept: (N,) bool, the episodes whose spread counts.
+        widths: How many of the d dimensions belong to each feature, in order; empty for one feature.
+
+    Raises:
+        ValueError: If nothing moves.
+    """
+    chosen = [s for s, keep in zip(states, kept, strict=True) if keep]
+    frames = np.concatenate(chosen)
+    centre, spread = frames.mean(axis=0), frames.std(axis=0)
+    constant = spread <= 1e-6 * np.maximum(1.0, np.abs(centre))
+    spread = np.where(constant, 1.0, spread)
+    vectors = all(len(s) == 1 for s in states)
+    within = np.sqrt(np.mean([s.var(axis=0) for s in chosen], axis=0))
+    moving = np.flatnonzero(~constant if vectors else ~constant & (within > MOVES * spread))
+    if not len(moving):
+        raise ValueError(
+            f"nothing moves in {source.function or ', '.join(source.keys)}: there are no ways to tell apart"
+        )
+    scaling = Scaling(source, centre, spread, moving, _weights(moving, widths))
+    scaled = [scaling(s) for s in states]
+    ways = [scaling.ways(s) for s in scaled]
+    paths = np.stack(ways) if vectors else walk_all(ways, POINTS)
+    firsts = np.stack([s[0] for s in scaled])
+    firsts[:, constant] = 0.0
+    return Paths(scaling, paths, firsts)
+
+
+def _weights(moving: np.ndarray, widths: Sequence[int]) -> np.ndarray:
+    """(m,) weights by which the moving dimensions of every feature have the same variance together."""
+    if not widths:
+        return np.ones(len(moving))
+    feature = np.repeat(np.arange(len(widths)), widths)[moving]
+    counts = np.bincount(feature, minlength=len(widths))
+    return np.sqrt(len(moving) / (np.count_nonzero(counts) * counts[feature]))
+
+
+def fit_features(paths: Paths, kept: np.ndarray, without_scene: bool) -> tuple[Features, np.ndarray]:
+    """Fit what is common to the kept episodes.
+
+    Args:
+        paths: N episodes.
+        kept: (N,) bool.
+        without_scene: Subtract what the first state predicts.
+
+    Returns:
+        The definition, and (N, P·m) the paths of all episodes less the mean path (of their scenes).
+    """
+    flat = paths.paths.reshape(len(paths.paths), -1)
+    scene = paths.scene if without_scene else np.array([], int)
+    slope, offset = np.zeros((len(scene), flat.shape[1])), flat[kept].mean(axis=0)
+    if len(scene):
+        fit = RidgeCV(alphas=PENALTIES).fit(paths.firsts[kept][:, scene], flat[kept])
+        slope, offset = fit.coef_.T, fit.intercept_
+    residuals = flat - offset - paths.firsts[:, scene] @ slope
+    directions = main_directions(residuals[kept])
+    return Features(paths.scaling, paths.paths.shape[1], scene, slope, offset, directions), residuals
+
+
+def main_directions(residuals: np.ndarray) -> np.ndarray:
+    """(k, D) orthonormal directions that hold most of the variance of (N, D) rows."""
+    centred = residuals - residuals.mean(axis=0)
+    if len(centred) < centred.shape[1]:
+        _, values, directions = np.linalg.svd(centred, full_matrices=False)
+        variance = values**2
+    else:
+        variance, vectors = np.linalg.eigh(centred.T @ centred)
+        variance, directions = variance[::-1].clip(0), vectors.T[::-1]
+    total = variance.sum()
+    if total <= 0:
+        return directions[:1]
+    count = min(MOST_DIRECTIONS, int(np.searchsorted(np.cumsum(variance) / total, KEPT)) + 1)
+    return directions[:count]
+
+
+def rounded(values: np.ndarray) -> list[Any]:
+    """Numbers of six significant digits, as nested lists."""
+    return np.array([float(f"{v:.6g}") for v in np.ravel(values)]).reshape(np.shape(values)).tolist()

@@ -1,0 +1,194 @@
+"""Episodes that fit nowhere, and why, in words.
+
+An episode is suspicious if one of a few numbers is far beyond those of the others, on a logarithmic scale:
+the distance of its path to the nearest other one, those of its start and its end, its roughness; if it has
+few frames or covers little way; or if it is rather far from the others and played backwards, or as a part of
+another one, is not. How far is far is measured by the median and the quartiles of all episodes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sklearn.neighbors import NearestNeighbors
+
+FAR = 5.0  # robust standard deviations of the logarithm
+FARTHER = 6.0  # the same, for numbers that vary for good reasons, too
+NEIGHBOURS = 3  # by which starts and ends are judged: several episodes may begin or end oddly
+LEAST_FACTOR = 1.6  # and at least this many times the median
+SHORT, STILL = 0.35, 0.15  # shares of the median of frames, of the way covered
+LEAST_APART = 0.3  # of starts and ends that are far away, in units of a dimension's spread
+ROUGH = 5.0  # times the usual roughness that is called noise
+COVERED = 0.9  # a path that was cut off shows at most this share of the whole one
+DOUBTFUL = 2.0  # times the usual distance to the nearest path, from which on these are looked for
+CLOSER = 0.5  # a path fits so much better backwards, or as a part
+COMPARED = 500  # paths with which it is compared
+
+
+@dataclass(frozen=True)
+class Manner:
+    """Simple numbers of N episodes, in standardised units.
+
+    Attributes:
+        frames: (N,) number of frames.
+        way: (N,) length of the way that was covered, after smoothing.
+        roughness: (N,) mean change of the step from frame to frame.
+        firsts: (N, m) first states.
+        lasts: (N, m) last states.
+    """
+
+    frames: np.ndarray
+    way: np.ndarray
+    roughness: np.ndarray
+    firsts: np.ndarray
+    lasts: np.ndarray
+
+
+def describe_manner(states: Sequence[np.ndarray], paths: np.ndarray) -> Manner:
+    """Measure N episodes of moving dimensions (T_i, m) and their (N, P, m) paths."""
+    return Manner(
+        np.array([len(s) for s in states], float),
+        np.linalg.norm(np.diff(paths, axis=1), axis=2).sum(axis=1),
+        np.array(
+            [np.linalg.norm(np.diff(s, 2, axis=0), axis=1).mean() if len(s) > 2 else 0.0 for s in states]
+        ),
+        np.stack([s[0] for s in states]),
+        np.stack([s[-1] for s in states]),
+    )
+
+
+def nearest_distance(points: np.ndarray, kept: np.ndarray, count: int = 1) -> np.ndarray:
+    """(N,) mean distance of each of (N, D) points to the `count` nearest others of those that are kept."""
+    count = min(count, int(kept.sum()) - 1)
+    if count < 1:
+        return np.zeros(len(points))
+    search = NearestNeighbors(n_neighbors=count + 1, algorithm="brute").fit(points[kept])
+    found, _ = search.kneighbors(points)  # (N, count + 1), of the kept ones the first is themselves
+    return np.where(kept, found[:, 1:].mean(axis=1), found[:, :count].mean(axis=1))
+
+
+def far_beyond(values: np.ndarray, kept: np.ndarray, far: float = FAR) -> np.ndarray:
+    """(N,) bool, positive numbers that are far beyond those of the kept episodes."""
+    logarithms = np.log(np.maximum(values, 1e-12))
+    low, median, high = np.quantile(logarithms[kept], [0.25, 0.5, 0.75])
+    spread = max((high - median) / 0.6745, (high - low) / 1.349, 0.02)
+    return (logarithms > median + far * spread) & (values > LEAST_FACTOR * np.exp(median))
+
+
+def suspicious(
+    paths: np.ndarray, residuals: np.ndarray, manner: Manner | None, kept: np.ndarray
+) -> np.ndarray:
+    """(N,) bool, the episodes that fit nowhere.
+
+    Args:
+        paths: (N, P, m).
+        residuals: (N, D) what the paths are compared by.
+        manner: None for vectors, of which nothing else is known.
+        kept: (N,) bool, the episodes that tell what is usual.
+    """
+    result = far_beyond(nearest_distance(residuals, kept), kept)
+    if manner is None:
+        return result
+    usual_way, usual_frames = np.median(manner.way[kept]), np.median(manner.frames[kept])
+    return (
+        result
+        | _far_away(manner.firsts, kept)
+        | _far_away(manner.lasts, kept)
+        | far_beyond(manner.roughness, kept, FARTHER)
+        | (manner.way < STILL * usual_way)
+        | (manner.frames < SHORT * usual_frames)
+        | _spoiled(paths, kept)
+    )
+
+
+def _far_away(places: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """(N,) bool, the starts or ends (N, m) that lie where no other's does."""
+    distance = nearest_distance(places, kept, NEIGHBOURS)
+    return far_beyond(distance, kept, FARTHER) & (distance > LEAST_APART)
+
+
+def reason(
+    episode: int, paths: np.ndarray, residuals: np.ndarray, manner: Manner | None, kept: np.ndarray
+) -> str:
+    """Why an episode fits nowhere.
+
+    Args:
+        episode: Its number.
+        paths: (N, P, m).
+        residuals: (N, P·m).
+        manner: See `suspicious`.
+        kept: (N,) bool, the episodes that fit somewhere.
+    """
+    others = np.flatnonzero(kept)
+    distance = np.linalg.norm(residuals[others] - residuals[episode], axis=1)
+    usual = float(np.median(nearest_distance(residuals, kept)[kept]))
+    times = (
+        f"{distance.min() / usual:.1f} times as far from the nearest episode as usual" if usual else "alone"
+    )
+    if manner is None:
+        return f"far from all others: {times}"
+    frames, way = manner.frames[episode], manner.way[episode] / np.median(manner.way[kept])
+    if way < STILL:
+        return f"frozen: covers {way:.0%} of the usual way"
+    if frames < SHORT * np.median(manner.frames[kept]):
+        return f"too short: {int(frames)} frames, {np.median(manner.frames[kept]):.0f} are usual"
+    roughness = manner.roughness[episode] / max(np.median(manner.roughness[kept]), 1e-12)
+    if far_beyond(manner.roughness, kept)[episode] and roughness > ROUGH:
+        return f"noise: steps change {roughness:.1f} times as much as usual from frame to frame"
+    spoiled = _spoiled_how(episode, paths, others)
+    if spoiled is not None:
+        return spoiled
+    far_ends = [
+        name
+        for name, places in (("start", manner.firsts), ("end", manner.lasts))
+        if _far_away(places, kept)[episode]
+    ]
+    where = f"; its {' and '.join(far_ends)} lies where no other's does" if far_ends else ""
+    return f"path far from any: {times}{where}"
+
+
+def _spoiled(paths: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """(N,) bool, the episodes rather far from others that are another one played backwards, or cut off."""
+    distance = nearest_distance(paths.reshape(len(paths), -1), kept)
+    doubtful = np.flatnonzero(distance > DOUBTFUL * np.median(distance[kept]))
+    doubtful = doubtful[np.argsort(-distance[doubtful])][: max(20, len(paths) // 20)]
+    others = np.flatnonzero(kept)
+    result = np.zeros(len(paths), dtype=bool)
+    for i in doubtful:
+        result[i] = _spoiled_how(int(i), paths, others) is not None
+    return result
+
+
+def _spoiled_how(episode: int, paths: np.ndarray, others: np.ndarray) -> str | None:
+    """Whether an episode is another one played backwards, or cut off, in words; None if it is neither."""
+    others = others[others != episode]
+    if len(others) > COMPARED:
+        others = others[np.linspace(0, len(others) - 1, COMPARED).astype(int)]
+    own, whole = paths[episode], paths[others]
+    forward, backward = _apart(own, whole).min(), _apart(own[::-1], whole).min()
+    part, share = _as_part(own, whole)
+    if backward < CLOSER * forward and backward < part:
+        return "reversed: played backwards it follows another episode"
+    if part < CLOSER * forward and share < COVERED:
+        return f"cut off: follows another episode for {share:.0%} of its way and ends there"
+    return None
+
+
+def _apart(path: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(M,) root mean square distance of a path (P, m) to others (M, P, m)."""
+    return np.sqrt(np.square(others - path).sum(axis=2).mean(axis=1))
+
+
+def _as_part(path: np.ndarray, others: np.ndarray) -> tuple[float, float]:
+    """The least distance of a path to a beginning of one of the others, and what share of it this is."""
+    points = len(path)
+    best, best_share = np.inf, 1.0
+    for share in np.linspace(0.2, 1.0, 17):
+        at = np.linspace(0, share * (points - 1), points)
+        left = np.minimum(at.astype(int), points - 2)
+        weight = (at - left)[None, :, None]
+        begun = others[:, left] * (1 - weight) + others[:, left + 1] * weight
+        apart = float(_apart(path, begun).min())
+        if apart < best:
+            best, best_share = apart, float(share)
+    return best, best_share
