@@ -101,5 +101,15 @@ def load_style_metrics(paths: str | None) -> dict[str, Callable[..., Any]]:
     Raises:
         ValueError: If a path does not lead to a function.
     """
-    listed = [path.strip() for path in (paths or "").split(",") if path.strip()]
-    return {path.partition(":")[2]: load_function("style_metrics", path) for path in listed}
+    functions = [path for path in listed(paths) if not is_metric_file(path)]
+    return {path.partition(":")[2]: load_function("style_metrics", path) for path in functions}
+
+
+def is_metric_file(path: str) -> bool:
+    """Whether a part of ``style_metrics`` is a file of values rather than ``module:function``."""
+    return path.lower().endswith((".json", ".csv"))
+
+
+def listed(paths: str | None) -> list[str]:
+    """The parts of a list separated by commas."""
+    return [path.strip() for path in (paths or "").split(",") if path.strip()]

@@ -10,6 +10,7 @@ from conftest import SMALL_MAZE, save_checkpoint, train_flags
 from lerobot.scripts import lerobot_eval
 
 from lerobot_swr.cli import eval as eval_command
+from lerobot_swr.envs.maze2d.behavior import small
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.evaluation.metrics import histogram, l1_distance
 from lerobot_swr.evaluation.rollouts import StateRecorder
@@ -140,11 +141,30 @@ def test_offline_errors_are_smallest_for_the_own_style(run_command, trained_zbc,
     """On frames: own style below nearest below random; the table by dimension averages to the same."""
     result = evaluate(run_command, trained_zbc, small_maze, tmp_path)
     error = result["action_error"]
-    assert set(error) == {"own", "nearest", "random"}
+    assert set(error) == {"own", "nearest", "random", "same", "other"}
     assert error["own"] < error["nearest"] < error["random"]
     for kind, value in error.items():
         assert np.mean(result["action_error_by_dimension"][kind]) == pytest.approx(value, rel=1e-5)
     assert (tmp_path / "offline.png").exists()
+
+
+def test_offline_errors_by_behavior(run_command, trained_zbc, small_maze, small_maze_meta, tmp_path):
+    """Behaviours make up the whole; styles of the same behaviour explain more than those of another."""
+    result = evaluate(run_command, trained_zbc, small_maze, tmp_path / "known")
+    table, error = result["action_error_by_behavior"], result["action_error"]
+    assert list(table) == ["10", "20"]  # the most frequent first
+    episodes = load_trajectories(small_maze_meta, ["observation.state"])
+    behaviors = np.array([small(episode) for episode in episodes.episodes()])
+    frames = {name: episodes.lengths[behaviors == name].sum() for name in table}
+    for kind in ("own", "same", "other"):
+        whole = sum(frames[name] * table[name][kind] for name in table) / sum(frames.values())
+        assert whole == pytest.approx(error[kind], rel=1e-5)
+    assert error["own"] < error["same"] < error["other"]
+    first = [int(np.flatnonzero(behaviors == name)[0]) for name in table]
+    alone = f"--policy.style_episodes=[{first[0]},{first[1]}]"
+    result = evaluate(run_command, trained_zbc, small_maze, tmp_path / "alone", alone)
+    assert "same" not in result["action_error"]
+    assert result["action_error"]["other"] == pytest.approx(result["action_error"]["nearest"])
 
 
 def test_offline_evaluation_keeps_to_the_styles_that_may_be_drawn(

@@ -152,7 +152,7 @@ def test_playback_of_some_demonstrations_is_that_of_a_dataset_of_them(demonstrat
         (("--style_sampling=fixed", "--policy.style_sampling=uniform", *ENV), ("--policy.style_sampling",)),
         (("--baseline=playback", "--policy.type=zbc", *ENV), ("--baseline", "--policy.*")),
         (("--robustness=true",), ("--robustness", "--env.type")),
-        (("--counterfactual=3", "--behavior_rule=a:b"), ("--counterfactual, --behavior_rule", "--env.type")),
+        (("--counterfactual=3", "--batch_size=5"), ("--counterfactual, --batch_size", "--env.type")),
     ],
 )
 def test_flags_without_effect_are_refused(run_command, small_maze, tmp_path, capsys, flags, named):

@@ -100,9 +100,10 @@ def find_behaviors(cfg: BehaviorsCommand) -> None:
     """Find the behaviours of a dataset and write them down."""
     assert cfg.output_dir is not None
     meta = cfg.dataset.metadata()
-    keys = cfg.keys or _default_keys(meta)
-    source = Source(tuple(keys), cfg.features)
+    source = Source(tuple(cfg.keys or _default_keys(meta)), cfg.features)
     trajectories = _read(meta, source)
+    if cfg.keys is None and cfg.features is None:
+        source = Source(_varying(trajectories))  # new episodes need not have what tells nothing
     found = discover(
         trajectories, source, cfg.num_behaviors, cfg.min_episodes, find_outliers=cfg.outliers, seed=cfg.seed
     )
@@ -122,7 +123,7 @@ def find_behaviors(cfg: BehaviorsCommand) -> None:
         _write_copy(meta, found, trajectories, cfg.label_column)
         print(f"dataset with column {COLUMN!r} written to {cfg.label_column}")
     print(
-        f"written to {cfg.output_dir}: look at {REPORT_FILE}, name the behaviours there, and use {RULE_FILE} as "
+        f"written to {cfg.output_dir}: look at {REPORT_FILE}, name the behaviours there, and use them: "
         f"--behavior_rule={cfg.output_dir / RULE_FILE}"
     )
 
@@ -133,6 +134,12 @@ def _default_keys(meta: LeRobotDatasetMetadata) -> list[str]:
         key for key in (OBS_STATE, OBS_ENV_STATE) if key in meta.features and is_numeric(meta.features[key])
     ]
     return keys or [ACTION]
+
+
+def _varying(trajectories: Trajectories) -> tuple[str, ...]:
+    """The features that are not the same in all frames; all if none is."""
+    keys = tuple(key for key, column in trajectories.columns.items() if np.ptp(column, axis=0).any())
+    return keys or tuple(trajectories.columns)
 
 
 def _read(meta: LeRobotDatasetMetadata, source: Source) -> Trajectories:

@@ -45,7 +45,13 @@ from lerobot_swr.evaluation.length_control import (
     format_length_control,
     frames_after_end,
 )
-from lerobot_swr.evaluation.offline import KINDS, format_offline, frame_errors, summarize
+from lerobot_swr.evaluation.offline import (
+    KINDS,
+    format_offline,
+    frame_errors,
+    known_behaviors,
+    summarize,
+)
 from lerobot_swr.evaluation.playback import playback_checkpoint
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_offline
 from lerobot_swr.evaluation.replay import format_replay, run_replay
@@ -67,7 +73,9 @@ def evaluate(cfg: EvalCommand) -> None:
     checkpoint, trajectories = _load(cfg)
     title = f"{checkpoint.policy.config.type} on {Path(trajectories.name).name}"
     if cfg.env is None:
-        errors = frame_errors(checkpoint, trajectories, cfg.dataset.episodes, cfg.seed)
+        rule = None if cfg.behavior_rule is None else load_behavior_rule(cfg.behavior_rule)
+        behaviors = known_behaviors(checkpoint, trajectories, rule)
+        errors = frame_errors(checkpoint, trajectories, cfg.dataset.episodes, cfg.seed, behaviors)
         offline = summarize(errors)
         write_json(cfg.output_dir / "offline.json", offline, _provenance(cfg))
         per_frame = {kind: squared.mean(axis=1) for kind, squared in errors.squared.items()}

@@ -31,7 +31,7 @@ CONFLICTS = {
 }
 NEEDS_ENV = (
     *("robustness", "counterfactual", "blend", "length_band"),
-    *("style_sampling", "behavior_rule", "n_episodes", "batch_size", "recorded_starts", "scenes"),
+    *("style_sampling", "n_episodes", "batch_size", "recorded_starts", "scenes"),
     *("policy.style_sampling", "policy.style_interpolate"),
 )
 

@@ -52,7 +52,8 @@ class EvalCommand:
     robustness: bool = False
     # [shortest, longest] in frames: compare the rollouts' lengths with the demonstrations' in this band.
     length_band: list[int] | None = None
-    # Labels episodes: module:function; null takes the environment's own rule.
+    # Labels episodes: module:function, or behaviors.json (lerobot-swr-behaviors finds it); null takes the
+    # environment's own rule.
     behavior_rule: str | None = None
     # Seeds the drawing of styles and the environments.
     seed: int = 1000

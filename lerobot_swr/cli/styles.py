@@ -58,9 +58,10 @@ class StylesCommand:
     # The training dataset, for the map and for --add; giving it makes the table anew. null takes the dataset
     # that the checkpoint's train_config.json names.
     dataset: DatasetSource = field(default_factory=DatasetSource)
-    # Make the table anew with this rule for the column "behavior": module:function.
+    # Make the table anew with this rule for the column "behavior": module:function or behaviors.json.
     behavior_rule: str | None = None
-    # Make the table anew with these further columns: module:function, several separated by commas.
+    # Make the table anew with these further columns: module:function, or a .json or .csv file of values of
+    # the episodes; several are separated by commas.
     style_metrics: str | None = None
     # Find styles for the demonstrations of the dataset in this folder and write a new checkpoint.
     add: Path | None = None

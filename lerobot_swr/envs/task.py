@@ -53,7 +53,7 @@ class Task:
         """
         raise MissingRuleError(
             f"env.type={self.env_cfg.type!r} has no behaviour rule of its own: name one with "
-            "--behavior_rule=module:function"
+            "--behavior_rule=module:function, or find one: lerobot-swr-behaviors"
         )
 
     def start_rule(self) -> StartRule:

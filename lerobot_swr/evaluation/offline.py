@@ -1,6 +1,7 @@
 """Offline evaluation: action errors on a dataset's frames, where there is no simulator."""
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 
+from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
 from lerobot_swr.policies.demonstration_frames import dataset_frames
@@ -22,6 +24,8 @@ KINDS = {
     "own": "own style",
     "nearest": "style of the nearest other demonstration",
     "random": "style of a random other demonstration",
+    "same": "style of another demonstration of its behaviour",
+    "other": "style of a demonstration of another behaviour",
     "none": "no style",
 }
 
@@ -38,6 +42,9 @@ class OfflineResult:
             dimensions.
         action_error_interval: Its bootstrap 95 % interval over episodes.
         action_error_by_dimension: The same mean for each action dimension, in order.
+        action_error_by_behavior: Behaviour of the demonstrations to the mean for each kind of style; null
+            where none of its frames has such a style (a behaviour of one demonstration, or the only one).
+            None where behaviours are not known.
     """
 
     n_episodes: int
@@ -45,6 +52,7 @@ class OfflineResult:
     action_error: dict[str, float]
     action_error_interval: dict[str, Interval]
     action_error_by_dimension: dict[str, list[float]]
+    action_error_by_behavior: dict[str, dict[str, float | None]] | None = None
 
 
 @dataclass(frozen=True)
@@ -54,16 +62,35 @@ class FrameErrors:
     Attributes:
         episodes: (F,) episode of each frame.
         phase: (F,) place of each frame in its episode, 0 to 1.
-        squared: Kind of style to (F, A) squared errors in normalised units.
+        squared: Kind of style to (F, A) squared errors in normalised units; NaN for frames that have no style
+            of this kind.
+        behaviors: Label of every episode of the dataset, or None.
     """
 
     episodes: np.ndarray
     phase: np.ndarray
     squared: dict[str, np.ndarray]
+    behaviors: Sequence[str] | None = None
+
+
+def known_behaviors(
+    checkpoint: Checkpoint, trajectories: Trajectories, rule: BehaviorRule | None
+) -> list[str] | None:
+    """The label of every episode: by the rule, else as the checkpoint's table has it; None if unknown."""
+    if rule is not None:
+        return [rule(episode) for episode in trajectories.episodes()]
+    table = checkpoint.policy.styles.table if checkpoint.has_styles else None
+    if table is None or "behavior" not in table.columns:
+        return None
+    return [str(label) for label in table.columns["behavior"][: len(trajectories)]]
 
 
 def frame_errors(
-    checkpoint: Checkpoint, trajectories: Trajectories, episodes: list[int] | None = None, seed: int = 0
+    checkpoint: Checkpoint,
+    trajectories: Trajectories,
+    episodes: list[int] | None = None,
+    seed: int = 0,
+    behaviors: Sequence[str] | None = None,
 ) -> FrameErrors:
     """Predict every frame's action with each kind of style.
 
@@ -72,6 +99,7 @@ def frame_errors(
         trajectories: The dataset it was trained on.
         episodes: Only these; None takes all (of those whose styles may be drawn, for a style policy).
         seed: Seed of the random styles, one draw per frame.
+        behaviors: Label of every episode, to compare with styles of the same and of other behaviours, too.
 
     Raises:
         ValueError: For another type of policy, or when fewer than 2 episodes have a style.
@@ -105,10 +133,12 @@ def frame_errors(
     episode_of_frame = np.repeat(chosen, trajectories.lengths[chosen])
     if policy.has_styles:
         styles = _styles_of_frames(policy, trajectories, drawable, episode_of_frame, seed)
+        if behaviors is not None:
+            styles |= _styles_by_behavior(np.array(behaviors), drawable, episode_of_frame, seed)
     squared = {kind: _squared_errors(checkpoint, trajectories, frames, used) for kind, used in styles.items()}
     place = frames - trajectories.starts[episode_of_frame]
     phase = place / np.maximum(trajectories.lengths[episode_of_frame] - 1, 1)
-    return FrameErrors(episode_of_frame, phase, squared)
+    return FrameErrors(episode_of_frame, phase, squared, behaviors)
 
 
 def _styles_of_frames(
@@ -120,6 +150,24 @@ def _styles_of_frames(
     place = np.searchsorted(drawable, own)
     shift = np.random.default_rng(seed).integers(1, len(drawable), size=len(own))
     return {"own": own, "nearest": nearest[place], "random": drawable[(place + shift) % len(drawable)]}
+
+
+def _styles_by_behavior(
+    behaviors: np.ndarray, drawable: np.ndarray, own: np.ndarray, seed: int
+) -> dict[str, np.ndarray | None]:
+    """Kinds of style as in `_styles_of_frames`, -1 for frames that have none of this kind."""
+    rng = np.random.default_rng([seed, 1])
+    same, other = np.full(len(own), -1), np.full(len(own), -1)
+    for episode in np.unique(own):
+        rows = own == episode
+        is_same = behaviors[drawable] == behaviors[episode]
+        for styles, choices in (
+            (same, drawable[is_same & (drawable != episode)]),
+            (other, drawable[~is_same]),
+        ):
+            if len(choices):
+                styles[rows] = rng.choice(choices, rows.sum())
+    return {kind: used for kind, used in (("same", same), ("other", other)) if (used >= 0).any()}
 
 
 @torch.no_grad()
@@ -134,13 +182,16 @@ def _squared_errors(
         batch = read(frames[start : start + size])
         style = None
         if styles is not None:
-            used = torch.from_numpy(styles[start : start + size]).to(batch[OBS_STATE].device)
+            used = torch.from_numpy(styles[start : start + size].clip(min=0)).to(batch[OBS_STATE].device)
             style = policy.styles.embedding(used)
         with torch.random.fork_rng(devices=[]):  # a policy that draws noise draws the same for every style
             torch.manual_seed(start)
             predicted = policy.predict(batch, style)
         parts.append((predicted - present(batch[ACTION])).square().cpu().numpy())
-    return np.concatenate(parts)
+    errors = np.concatenate(parts)
+    if styles is not None:
+        errors[styles < 0] = np.nan
+    return errors
 
 
 def _reader(
@@ -168,22 +219,37 @@ def _reader(
 def summarize(errors: FrameErrors) -> OfflineResult:
     """Means and their bootstrap intervals over episodes."""
     names, place = np.unique(errors.episodes, return_inverse=True)
-    count = np.bincount(place)  # (E,) frames per episode
     draws = np.random.default_rng(0).integers(len(names), size=(BOOTSTRAP_DRAWS, len(names)))
     intervals = {}
     for kind, squared in errors.squared.items():
-        total = np.bincount(place, weights=squared.mean(axis=1))
-        resampled = total[draws].sum(axis=1) / count[draws].sum(axis=1)
+        known = ~np.isnan(squared[:, 0])
+        total = np.bincount(place[known], weights=squared[known].mean(axis=1), minlength=len(names))
+        count = np.bincount(place[known], minlength=len(names))  # (E,) frames per episode
+        resampled = total[draws].sum(axis=1) / np.maximum(count[draws].sum(axis=1), 1)
         intervals[kind] = Interval(*np.quantile(resampled, [0.025, 0.975]).tolist())
     return OfflineResult(
         n_episodes=len(names),
         n_frames=len(place),
-        action_error={kind: float(squared.mean()) for kind, squared in errors.squared.items()},
+        action_error={kind: float(np.nanmean(squared)) for kind, squared in errors.squared.items()},
         action_error_interval=intervals,
         action_error_by_dimension={
-            kind: squared.mean(axis=0).tolist() for kind, squared in errors.squared.items()
+            kind: np.nanmean(squared, axis=0).tolist() for kind, squared in errors.squared.items()
         },
+        action_error_by_behavior=None if errors.behaviors is None else _by_behavior(errors),
     )
+
+
+def _by_behavior(errors: FrameErrors) -> dict[str, dict[str, float | None]]:
+    """The mean errors of each behaviour, the most frequent first."""
+    label = np.array(errors.behaviors)[errors.episodes]  # (F,)
+    result: dict[str, dict[str, float | None]] = {}
+    for name, _ in Counter(label.tolist()).most_common():
+        rows = label == name
+        parts = {kind: squared[rows] for kind, squared in errors.squared.items()}
+        result[name] = {
+            kind: None if np.isnan(part).all() else float(np.nanmean(part)) for kind, part in parts.items()
+        }
+    return result
 
 
 def format_offline(result: OfflineResult) -> str:
@@ -193,5 +259,11 @@ def format_offline(result: OfflineResult) -> str:
     ]
     for kind, error in result.action_error.items():
         interval = result.action_error_interval[kind]
-        lines.append(f"  {KINDS[kind]:<42} {error:.5f}  {interval:.5f}")
+        lines.append(f"  {KINDS[kind]:<50} {error:.5f}  {interval:.5f}")
+    if result.action_error_by_behavior:
+        kinds = list(result.action_error)
+        lines.append("  " + "  ".join([f"{'behaviour':<24}", *(f"{kind:>8}" for kind in kinds)]))
+        for name, means in result.action_error_by_behavior.items():
+            cells = ("       -" if means[kind] is None else f"{means[kind]:8.5f}" for kind in kinds)
+            lines.append("  " + "  ".join([f"{name or '(none)':<24}", *cells]))
     return "\n".join(lines)

@@ -144,13 +144,15 @@ def plot_offline(
     figure = Figure(figsize=(11, 4), layout="constrained")
     bars, along = figure.subplots(1, 2, width_ratios=(1, 1.6))
     colors = {kind: f"C{i}" for i, kind in enumerate(errors)}
-    means = [values.mean() for values in errors.values()]
+    means = [np.nanmean(values) for values in errors.values()]
     drawn = bars.bar(list(errors), means, color=list(colors.values()))
     bars.bar_label(drawn, fmt="%.3g")
     bars.set(ylabel="mean squared action error\n(normalised units)", xlabel="style")
     bins = np.minimum((phase * 20).astype(int), 19)
     for kind, values in errors.items():
-        mean = [values[bins == b].mean() if (bins == b).any() else np.nan for b in range(20)]
+        known = ~np.isnan(values)
+        parts = [values[(bins == b) & known] for b in range(20)]
+        mean = [part.mean() if len(part) else np.nan for part in parts]
         along.plot((np.arange(20) + 0.5) / 20, mean, color=colors[kind])
     along.set(xlabel="share of the episode", ylabel="mean squared action error", yscale="log")
     along.legend([Line2D([], [], color=colors[kind]) for kind in errors], [describe(kind) for kind in errors])

@@ -248,10 +248,12 @@ class ZBCConfig(BCConfig):
     style_interpolate: list[float] | None = None
 
     # --- The demonstrations' table, made when the policy is created with its dataset ---
-    # Labels demonstrations in the column "behavior": module:function. null takes the rule of this package's
-    # own datasets; other datasets then have no such column.
+    # Labels demonstrations in the column "behavior": module:function, or behaviors.json as
+    # lerobot-swr-behaviors finds them. null takes the rule of this package's own datasets; other datasets
+    # then have no such column.
     behavior_rule: str | None = None
-    # Further columns: module:function, or several separated by commas; a column has its function's name.
+    # Further columns: module:function, whose name the column has, or a .json or .csv file with values of
+    # every episode; several are separated by commas.
     style_metrics: str | None = None
 
     # --- Set from the dataset by corrective labels; not meant to be given ---

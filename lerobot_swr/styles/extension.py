@@ -11,7 +11,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_swr.behaviors import dataset_behavior_rule, load_style_metrics
+from lerobot_swr.behaviors import dataset_behavior_rule, is_metric_file, listed, load_style_metrics
 from lerobot_swr.progress import Progress
 from lerobot_swr.similarity import Similarity, similarity_by
 from lerobot_swr.styles.cookbook import StyleCookbook
@@ -149,7 +149,8 @@ def _first_observation(episode: Frames, keys: Sequence[str]) -> Tensor:
 def _described(policy: StyledNetwork, added: Trajectories, robot_type: str | None) -> StyleTable | None:
     """Rows of the table for new demonstrations; None where there is no table.
 
-    Outcomes that they lack are dropped from the policy's table, unless a named filter needs them.
+    Outcomes that they lack, and columns that files hold for the training dataset, are dropped from the
+    policy's table, unless a named filter needs them.
 
     Raises:
         ValueError: If another column of the table cannot be computed.
@@ -163,9 +164,10 @@ def _described(policy: StyledNetwork, added: Trajectories, robot_type: str | Non
     metrics = load_style_metrics(config.style_metrics)
     rows = make_style_table(added, np.zeros((len(added), 0)), rule, metrics)
     missing = set(table.columns) - set(rows.columns)
-    if missing - OUTCOME_COLUMNS:
+    droppable = OUTCOME_COLUMNS if not any(map(is_metric_file, listed(config.style_metrics))) else missing
+    if missing - droppable:
         raise ValueError(
-            f"{where}: the columns {sorted(missing - OUTCOME_COLUMNS)} of the checkpoint's table cannot be "
+            f"{where}: the columns {sorted(missing - droppable)} of the checkpoint's table cannot be "
             "computed for it; name the rule or metric with --behavior_rule or --style_metrics "
             "(module:function)"
         )
@@ -173,8 +175,8 @@ def _described(policy: StyledNetwork, added: Trajectories, robot_type: str | Non
     if needed:
         raise ValueError(
             f"{where}: the columns {sorted(missing)} of the checkpoint's table, which the named filters "
-            f"{needed} look at, cannot be computed for it: it has no usable {' and '.join(OUTCOMES)}; "
-            "--forget the filters first, or add the feature"
+            f"{needed} look at, cannot be computed for it: it has no usable {' and '.join(OUTCOMES)}, or a "
+            "file holds them; --forget the filters first, or add the feature"
         )
     if missing:
         logger.warning("%s: columns of the table that cannot be computed are dropped: %s", where, missing)

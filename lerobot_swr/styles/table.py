@@ -23,6 +23,7 @@ from lerobot_swr.behaviors import BehaviorRule, dataset_behavior_rule, load_styl
 from lerobot_swr.envs.observed import SIMULATED, as_simulated
 from lerobot_swr.similarity import Similarity
 from lerobot_swr.styles.filters import Value, column_kind, select
+from lerobot_swr.styles.metric_files import read_metric_files
 from lerobot_swr.trajectories import Trajectories
 from lerobot_swr.whole_files import replacing
 
@@ -186,14 +187,21 @@ def make_nearest_table(
     Args:
         trajectories: The demonstrations.
         similarity: Their distances.
-        behavior_rule: ``module:function`` that labels them; None takes the rule of this package's datasets.
-        style_metrics: ``module:function`` of further columns, separated by commas.
+        behavior_rule: ``module:function`` or ``behaviors.json`` that labels them; None takes the rule of this
+            package's datasets.
+        style_metrics: Further columns: ``module:function``, and JSON and CSV files of values of the episodes,
+            separated by commas.
         robot_type: Of the dataset's metadata; finds the rule of this package's datasets.
     """
     everyone = np.arange(len(trajectories))
     neighbours, _ = similarity.nearest(everyone, MAX_NEIGHBOURS, everyone)
     rule = dataset_behavior_rule(behavior_rule, robot_type)
-    return make_style_table(trajectories, neighbours, rule, load_style_metrics(style_metrics))
+    table = make_style_table(trajectories, neighbours, rule, load_style_metrics(style_metrics))
+    read = read_metric_files(style_metrics, len(trajectories))
+    taken = sorted(read.keys() & table.columns.keys())
+    if taken:
+        logger.warning("style_metrics: the table has columns %s of its own; the files' are left out", taken)
+    return replace(table, columns={**table.columns, **{k: v for k, v in read.items() if k not in taken}})
 
 
 def _measured(name: str, metric: Metric, trajectories: Trajectories) -> list[Value]:
