@@ -229,17 +229,29 @@ def test_the_command_adds_pictures(run_command, tmp_path, capsys):
     assert not (tmp_path / "b").exists()
 
 
-@pytest.mark.parametrize("obs_type", ["both", "pixels"])
-def test_lerobots_act_trains_on_pictures_and_acts_in_the_environment(
-    lerobot_train_command, run_command, camera_datasets, tmp_path, obs_type
+TINY = {
+    "act": {
+        **{"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1},
+        **{"n_decoder_layers": 1, "chunk_size": 4, "n_action_steps": 4, "use_vae": "false"},
+    },
+    "diffusion": {
+        **{"down_dims": "[8,16]", "n_groups": 4, "diffusion_step_embed_dim": 8, "horizon": 8},
+        **{"n_action_steps": 4, "num_train_timesteps": 4, "spatial_softmax_num_keypoints": 4},
+    },
+}
+
+
+@pytest.mark.parametrize(
+    ("policy_type", "obs_type"), [("act", "both"), ("act", "pixels"), ("diffusion", "pixels")]
+)
+def test_lerobots_policies_train_on_pictures_and_act_in_the_environment(
+    lerobot_train_command, run_command, camera_datasets, tmp_path, policy_type, obs_type
 ):
     """``lerobot-train`` and ``lerobot-eval`` as they are, with a tiny network."""
-    sizes = {"dim_model": 16, "n_heads": 2, "dim_feedforward": 16, "n_encoder_layers": 1, "chunk_size": 4}
-    network = {**sizes, "n_decoder_layers": 1, "n_action_steps": 4, "use_vae": "false"}
     lerobot_train_command(
-        *train_flags("act", camera_datasets / obs_type, tmp_path / "run", 2),
+        *train_flags(policy_type, camera_datasets / obs_type, tmp_path / "run", 2),
         "--policy.pretrained_backbone_weights=null",
-        *(f"--policy.{key}={value}" for key, value in network.items()),
+        *(f"--policy.{key}={value}" for key, value in TINY[policy_type].items()),
         "--save_freq=2",
     )
     run_command(
