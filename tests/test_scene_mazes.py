@@ -11,6 +11,7 @@ from lerobot.envs import make_env
 
 from lerobot_swr.cli import dataset as dataset_command
 from lerobot_swr.demos.catalog import get_recipe
+from lerobot_swr.envs.maze2d import manner as ways
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, move
 from lerobot_swr.envs.maze2d.layouts import LAYOUTS
@@ -154,3 +155,25 @@ def test_a_recordings_path_blocked_by_other_doors_is_told_apart():
     left, right = ([0.45, 0.9, 0.41, 0.85], [0.45, 0.9, 0.15, 0.59])
     shown = [rule({STATE: walk, SCENE: np.tile(scene, (50, 1))}) for scene in (left, right)]
     assert shown == ["10", "20"]
+
+
+@pytest.mark.parametrize(
+    ("name", "rule"),
+    [("scenes_maze-two_ways", ways.scenes), ("scenes_large_maze-six_ways", ways.scenes_large)],
+)
+def test_ways_tell_which_door_wherever_it_is(name, rule):
+    """In the frame of the doors: near 0 for the leftmost, 1 for the rightmost, and little of the scene."""
+    recipe = get_recipe(name)
+    layout, rule = LAYOUTS[name.split("_maze-")[0]], getattr(ways, name.split("_maze-")[0])
+    for demonstration in islice(recipe.demonstrations(1), 40):
+        label = recipe.behavior_rule(demonstration.observations)
+        scene = demonstration.observations[SCENE][0]
+        for wall, checkpoint, way in zip(
+            maze_of(layout, scene).walls, label[:-1], rule(demonstration.observations), strict=True
+        ):
+            doors = [door.x for door in wall.doors]
+            x = next(door.x for door in wall.doors if str(door.checkpoint) == checkpoint)
+            width = max(doors) - min(doors)
+            assert abs(way - (x - min(doors)) / width) <= wall.doors[0].half_width / width
+    still = {STATE: np.full((3, 2), 0.1), SCENE: demonstration.observations[SCENE][:3]}
+    np.testing.assert_array_equal(rule(still), [0.5] * len(layout.walls))
