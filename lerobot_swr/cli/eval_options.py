@@ -135,17 +135,9 @@ class EvalCommand:
             return
         if not path:
             raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
-        check_checkpoint_path(path)
-        if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
-            raise ValueError(
-                f"policy.path={path!r}: no config.json in this folder; "
-                "give a checkpoint's pretrained_model folder"
-            )
-        overrides = _policy_overrides()
         if self.robustness and not _overrides("style_sampling"):
             self.style_sampling = self.style_sampling or "stratified"
-        self.policy = _stored_config(path, overrides)
-        self.policy.pretrained_path = Path(path)
+        self.policy = checkpoint_config(path)
         if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
             self.policy.style_sampling = self.style_sampling
 
@@ -153,6 +145,24 @@ class EvalCommand:
     def __get_path_fields__(cls) -> list[str]:
         """Keys that LeRobot's parser loads from a folder."""
         return ["policy"]
+
+
+def checkpoint_config(path: str) -> PreTrainedConfig:
+    """The configuration of the checkpoint at `path`, with the ``--policy.*`` options beside it.
+
+    Raises:
+        ValueError: If there is no checkpoint.
+        FileNotFoundError: If there is nothing.
+    """
+    check_checkpoint_path(path)
+    if Path(path).is_dir() and not (Path(path) / "config.json").is_file():
+        raise ValueError(
+            f"policy.path={path!r}: no config.json in this folder; "
+            "give a checkpoint's pretrained_model folder"
+        )
+    config = _stored_config(path, _policy_overrides())
+    config.pretrained_path = Path(path)
+    return config
 
 
 def _stored_config(path: str, overrides: list[str]) -> PreTrainedConfig:

@@ -1,6 +1,6 @@
 """The columns of a dataset: a recipe's demonstrations as an environment with that ``obs_type`` shows them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,14 @@ def check_columns(recipe: DatasetRecipe, obs_type: str) -> None:
         raise ValueError(f"obs_type={obs_type!r}: {recipe.name} has no pictures; leave out --images")
 
 
+def number_columns(features: Mapping[str, Sequence[str]]) -> dict[str, dict[str, Any]]:
+    """LeRobot's features of observations and actions, each with the names of its dimensions."""
+    return {
+        key: {"dtype": "float32", "shape": (len(names),), "names": list(names)}
+        for key, names in features.items()
+    }
+
+
 def feature_columns(recipe: DatasetRecipe, obs_type: str) -> dict[str, dict[str, Any]]:
     """LeRobot's features of a recipe.
 
@@ -30,10 +38,7 @@ def feature_columns(recipe: DatasetRecipe, obs_type: str) -> dict[str, dict[str,
         recipe: What to write.
         obs_type: Of the environment that the dataset is for.
     """
-    numbers = {
-        key: {"dtype": "float32", "shape": (len(names),), "names": list(names)}
-        for key, names in recipe.features.items()
-    }
+    numbers = number_columns(recipe.features)
     if obs_type == "state":
         return numbers
     shape = (*recipe.picture_size, 3)

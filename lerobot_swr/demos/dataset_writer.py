@@ -4,7 +4,7 @@ import json
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -76,7 +76,7 @@ def write_dataset(
                 desc=recipe.name,
                 unit="episode",
             ):
-                _add_episode(dataset, frame_columns(recipe, demonstration, obs_type), recipe.instruction)
+                add_episode(dataset, frame_columns(recipe, demonstration, obs_type), recipe.instruction)
                 histogram[recipe.behavior_rule(demonstration.observations)] += 1
         finally:
             dataset.finalize()  # else the writer would do so later, in a folder that is gone by then
@@ -105,7 +105,8 @@ def _removed_if_useless(work_dir: Path) -> Iterator[None]:
         raise
 
 
-def _add_episode(dataset: LeRobotDataset, columns: dict[str, np.ndarray], instruction: str) -> None:
+def add_episode(dataset: LeRobotDataset, columns: Mapping[str, np.ndarray], instruction: str) -> None:
+    """Write one episode, its observations and actions (T, ...), into a dataset that is open for writing."""
     for t in range(len(columns[ACTION])):
         frame = {
             key: column[t] if column.dtype == np.uint8 else np.asarray(column[t], dtype=np.float32)

@@ -18,6 +18,7 @@ from lerobot.envs import EnvConfig, make_env
 from lerobot.utils.constants import OBS_STATE
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.pointer import PlanePointer, Pointer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes  # half a second, for pictures alone
@@ -95,6 +96,33 @@ class Task:
     def perturbations(self) -> dict[str, dict[str, Any]]:
         """Ways of making the task harder, for robustness evaluations: name to the options that it sets."""
         return {}
+
+    @property
+    def rate_hz(self) -> float:
+        """Steps per second of the real thing."""
+        return float(self.env_cfg.fps)
+
+    def live(self) -> EnvConfig:
+        """The configuration whose pictures can be watched at that rate; by default as it is."""
+        return self.env_cfg
+
+    def pointer(self, env: gym.Env) -> Pointer:
+        """How a person's pointer in the picture acts; by default as the environment's metadata say.
+
+        Args:
+            env: An environment of this configuration.
+
+        Raises:
+            MissingRuleError: If the environment does not say so.
+        """
+        said = env.metadata.get("pointer")
+        if said is None:
+            raise MissingRuleError(
+                f"env.type={self.env_cfg.type!r} does not say how a pointer acts in it: give the "
+                "environment's class metadata['pointer'], or register a task with a pointer "
+                "(lerobot_swr.envs.pointer)"
+            )
+        return PlanePointer.of_metadata(said)
 
     def draw_scene(self, axes: "Axes") -> None:
         """Draw what does not move (walls, obstacles) behind the paths; by default nothing."""

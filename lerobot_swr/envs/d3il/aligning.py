@@ -94,6 +94,7 @@ class AligningEnv(ArmTask):
         render_mode: `rgb_array` or None.
         render_height: Of the pictures, in pixels.
         render_width: Of the pictures, in pixels.
+        render_shadows: Whether the pictures show shadows.
         start_radius: See `ArmPerturbations`.
         action_noise: See `ArmPerturbations`.
         box_push: See `ArmPerturbations`.
@@ -109,6 +110,7 @@ class AligningEnv(ArmTask):
         render_mode: str | None = None,
         render_height: int = 480,
         render_width: int = 640,
+        render_shadows: bool = True,
         start_radius: float = 0.0,
         action_noise: float = 0.0,
         box_push: float = 0.0,
@@ -124,6 +126,7 @@ class AligningEnv(ArmTask):
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
+            render_shadows=render_shadows,
             obs_type=obs_type,
             camera_size=camera_size,
         )

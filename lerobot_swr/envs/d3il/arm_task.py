@@ -11,7 +11,9 @@ import numpy as np
 from lerobot_swr.envs.d3il.dependencies import mujoco
 from lerobot_swr.envs.d3il.layouts import ACTION_LIMIT_M, FPS
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
+from lerobot_swr.envs.d3il.pointer import CameraPointer
 from lerobot_swr.envs.d3il.rendering import OffscreenCamera, shared_camera
+from lerobot_swr.envs.d3il.scene import CAMERA
 from lerobot_swr.envs.d3il.simulation import SETTLING_STEPS, ArmSimulation
 from lerobot_swr.envs.observed import check_obs_type, observation_space, observed, shows_pictures
 
@@ -36,6 +38,7 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         render_width: Of the pictures, in pixels.
         obs_type: What is observed, see `lerobot_swr.envs.observed`.
         camera_size: Side of the observed pictures, in pixels.
+        render_shadows: Whether the pictures show shadows.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  as Gymnasium declares it
@@ -54,12 +57,14 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         render_width: int,
         obs_type: str,
         camera_size: int,
+        render_shadows: bool,
     ):
         check_obs_type(obs_type)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: the D3IL tasks know None and 'rgb_array'")
         self.render_mode = render_mode
         self._picture_size = (render_height, render_width)
+        self._shadows = render_shadows
         self._camera: OffscreenCamera | None = None
         self._simulation = ArmSimulation(model)
         self._perturbations = perturbations
@@ -123,8 +128,19 @@ class ArmTask(gym.Env[Observation, np.ndarray], abc.ABC):
         if self.render_mode is None:
             return None
         if self._camera is None:
-            self._camera = OffscreenCamera(self._simulation.model, *self._picture_size)
+            self._camera = OffscreenCamera(
+                self._simulation.model, *self._picture_size, fast=not self._shadows
+            )
         return self._camera.picture(self._simulation.data)
+
+    def pointer(self) -> CameraPointer:
+        """How a pointer in the pictures moves the tool."""
+        model, data = self._simulation.model, mujoco.MjData(self._simulation.model)
+        camera = model.camera(CAMERA).id
+        mujoco.mj_forward(model, data)  # the camera does not move, so that any state shows where it stands
+        height, width = self._picture_size
+        fovy = np.radians(model.cam_fovy[camera])
+        return CameraPointer(data.cam_xpos[camera], data.cam_xmat[camera], fovy, width / height, self._n_axes)
 
     def close(self) -> None:
         """Free the OpenGL context, if any picture was made."""

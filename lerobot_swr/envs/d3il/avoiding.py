@@ -58,6 +58,7 @@ class AvoidingEnv(ArmTask):
         render_mode: `rgb_array` or None.
         render_height: Of the pictures, in pixels.
         render_width: Of the pictures, in pixels.
+        render_shadows: Whether the pictures show shadows.
         start_radius: See `ArmPerturbations`.
         action_noise: See `ArmPerturbations`.
         obs_type: `state`, `pixels` or `both`, see `lerobot_swr.envs.observed`.
@@ -72,6 +73,7 @@ class AvoidingEnv(ArmTask):
         render_mode: str | None = None,
         render_height: int = 480,
         render_width: int = 640,
+        render_shadows: bool = True,
         start_radius: float = 0.0,
         action_noise: float = 0.0,
         obs_type: str = "state",
@@ -86,6 +88,7 @@ class AvoidingEnv(ArmTask):
             render_mode=render_mode,
             render_height=render_height,
             render_width=render_width,
+            render_shadows=render_shadows,
             obs_type=obs_type,
             camera_size=camera_size,
         )

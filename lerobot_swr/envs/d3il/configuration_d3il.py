@@ -4,7 +4,7 @@ Importing this module needs neither MuJoCo nor numba; making an environment does
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,7 @@ from lerobot_swr.envs.d3il.layouts import (
     AVOIDING_EPISODE_LENGTH,
     BOX_POSITION_RANGE,
     CAMERA_SIZE,
+    CONTROL_PERIOD_S,
     FINISH_LINE_Y,
     FPS,
     OBSTACLES,
@@ -33,6 +34,7 @@ from lerobot_swr.envs.d3il.layouts import (
 from lerobot_swr.envs.d3il.perturbations import ArmPerturbations
 from lerobot_swr.envs.d3il.recorded_starts import aligning_start, avoiding_start
 from lerobot_swr.envs.observed import PICTURE_NAMES, check_obs_type, picture_features, shows_pictures
+from lerobot_swr.envs.pointer import Pointer
 from lerobot_swr.envs.task import StartRule
 from lerobot_swr.envs.thread_vector_env import ThreadVectorEnv
 
@@ -85,6 +87,8 @@ class D3ILEnvConfig(TaskEnvConfig):
     # Size of the rendered picture, in pixels.
     render_height: int = 480
     render_width: int = 640
+    # Shadows; with a software renderer they take nine tenths of a picture's time.
+    render_shadows: bool = True
     render_mode: str = "rgb_array"
 
     features: dict[str, PolicyFeature] = field(default_factory=dict)
@@ -139,6 +143,7 @@ class D3ILEnvConfig(TaskEnvConfig):
             "render_mode": self.render_mode,
             "render_height": self.render_height,
             "render_width": self.render_width,
+            "render_shadows": self.render_shadows,
             "start_radius": self.start_radius,
             "action_noise": self.action_noise,
             "obs_type": self.obs_type,
@@ -179,6 +184,20 @@ class D3ILEnvConfig(TaskEnvConfig):
         if self.task == "aligning":
             found |= {"box pushed 2 cm": {"box_push": 0.02}, "box pushed 5 cm": {"box_push": 0.05}}
         return found
+
+    @property
+    def rate_hz(self) -> float:
+        """That of the arm's controller."""
+        return 1 / CONTROL_PERIOD_S
+
+    def live(self) -> EnvConfig:
+        """Smaller pictures without shadows."""
+        height, width = min(self.render_height, 360), min(self.render_width, 480)
+        return replace(self, render_height=height, render_width=width, render_shadows=False)
+
+    def pointer(self, env: gym.Env) -> Pointer:
+        """The tool follows the pointer on the table as the camera shows it."""
+        return env.unwrapped.pointer()  # type: ignore[attr-defined]
 
     def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
         """(T, 2) path in the table's plane as pictures show it, y to the right: the tool's or the box's."""

@@ -1,7 +1,7 @@
 """Maze2D as a LeRobot environment: ``--env.type=maze2d --env.task=small|medium|large|scenes``, and more."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -15,11 +15,12 @@ from lerobot_swr.envs.configuration_env import TaskEnvConfig
 from lerobot_swr.envs.maze2d.agents import MazeAgents
 from lerobot_swr.envs.maze2d.behavior import MazeBehaviorRule
 from lerobot_swr.envs.maze2d.camera import CAMERA_SIZE
-from lerobot_swr.envs.maze2d.dynamics import in_goal
+from lerobot_swr.envs.maze2d.dynamics import MAX_STEP, in_goal
 from lerobot_swr.envs.maze2d.env import FPS, Maze2DVectorEnv
 from lerobot_swr.envs.maze2d.layouts import MazeLayout, Scenes, get_layout
 from lerobot_swr.envs.maze2d.scenes import scene_names
 from lerobot_swr.envs.observed import PICTURE_NAMES, picture_features
+from lerobot_swr.envs.pointer import PlanePointer, Pointer
 from lerobot_swr.envs.task import StartRule
 
 if TYPE_CHECKING:
@@ -172,6 +173,14 @@ class Maze2DEnvConfig(TaskEnvConfig):
             "sticky walls": {"sticky_walls": True},
             "sticky, noise 1": {"sticky_walls": True, "transition_noise": 1.0},
         }
+
+    def live(self) -> EnvConfig:
+        """Larger pictures."""
+        return replace(self, render_size=max(self.render_size, 480))
+
+    def pointer(self, env: gym.Env) -> Pointer:
+        """The agent follows the pointer, as fast as it can."""
+        return PlanePointer((0, 1), (0, 1), "displacement", speed=MAX_STEP, scale=MAX_STEP)
 
     def draw_scene(self, axes: "Axes") -> None:
         """Walls, door numbers and the goal; where scenes differ, all that they have in common."""

@@ -3,17 +3,21 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
+import gymnasium as gym
 import numpy as np
 from lerobot.envs.configs import PushtEnv
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.pointer import PlanePointer, Pointer
 from lerobot_swr.envs.pusht.block import GOAL_POSE, OUTLINE, keypoints_of, reset_state
 from lerobot_swr.envs.task import StartRule, Task, task_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes  # half a second, for pictures alone
 
+FIELD = 512  # side of the field, in its unit
+MAX_LEAD = 60  # how far ahead of the agent its set-point is put; demonstrators led it by as much
 KEYPOINT_OBSERVATIONS = "environment_state_agent_pos"
 
 
@@ -50,6 +54,10 @@ class PushTTask(Task):
         """Where block and agent lie."""
         return True
 
+    def pointer(self, env: gym.Env) -> Pointer:
+        """The agent is led to the pointer's place."""
+        return PlanePointer((0, FIELD), (FIELD, 0), "position", speed=MAX_LEAD)
+
     def plot_path(self, observations: Mapping[str, np.ndarray]) -> np.ndarray:
         """(T, 2) path of the middle of the block's keypoints, in pixels."""
         return observations[OBS_ENV_STATE].reshape(-1, 8, 2).mean(axis=1)
@@ -57,7 +65,7 @@ class PushTTask(Task):
     def draw_scene(self, axes: "Axes") -> None:
         """The goal, in the field as the environment renders it (y downwards)."""
         axes.fill(*keypoints_of(GOAL_POSE)[list(OUTLINE)].T, color="lightgreen")
-        axes.set(xlim=(0, 512), ylim=(512, 0))
+        axes.set(xlim=(0, FIELD), ylim=(FIELD, 0))
 
     def _check_observations(self) -> None:
         observed = self.env_cfg.obs_type  # type: ignore[attr-defined]
