@@ -10,7 +10,8 @@ import joblib
 import pytest
 
 from lerobot_swr.reproduction import execution
-from lerobot_swr.reproduction.cells import Store
+from lerobot_swr.reproduction.cells import Cell, Labels, Store
+from lerobot_swr.reproduction.demonstrations import Demonstrations
 from lerobot_swr.reproduction.execution import reproduce, run_chain
 from lerobot_swr.reproduction.settings import ReproductionSettings
 
@@ -36,6 +37,7 @@ def ray_cluster() -> Iterator[str]:
     ray = pytest.importorskip("ray", reason="needs the extra [ray]")
     from ray.util.joblib import register_ray
 
+    os.environ.setdefault("RAY_raylet_start_wait_time_s", "300")  # on a busy machine
     ray.init(num_cpus=WORKERS, include_dashboard=False, log_to_driver=False)
     register_ray()
     try:
@@ -73,6 +75,32 @@ def local(small_maze, tmp_path_factory):
     with joblib.parallel_config(n_jobs=1):
         assert reproduce(settings) == []
     return results_of(settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("cluster", [dask_cluster, ray_cluster])
+def test_cells_of_a_killed_worker_are_computed_by_another(tmp_path, monkeypatch, cluster):
+    """Four cells without any work, one of which kills its worker once: all are done."""
+    store = Store(tmp_path / "store")
+    cells = [Cell("similarity", Labels("data", "", name), {"name": name}) for name in "abcd"]
+    killed = tmp_path / "killed"
+
+    def run_in_worker(chain, *args):
+        def compute(one, *_):
+            if one.labels.condition == "b" and not killed.exists():
+                killed.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+            return {"name": one.labels.condition}
+
+        execution._compute = compute  # of the worker process
+        return run_chain(chain, *args)
+
+    monkeypatch.setattr(execution, "run_chain", run_in_worker)
+    data = Demonstrations("data", tmp_path, "", {}, ())
+    with cluster() as backend, joblib.parallel_config(backend=backend, n_jobs=WORKERS):
+        assert execution.run_cells(cells, store, {"data": data}, jobs=None) == []
+    assert killed.exists()
+    assert [store.read(one)["name"] for one in cells] == list("abcd")
 
 
 @pytest.mark.slow
