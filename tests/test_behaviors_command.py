@@ -138,6 +138,23 @@ def test_evaluations_take_the_file(run_command, folder: Path, maze: Path, meta, 
     assert result["l1_floor"] == 0
 
 
+def test_results_do_not_replace_the_rule(run_command, folder: Path, maze: Path, capsys):
+    """An evaluation into the rule's folder is refused: its results have the same name."""
+    before = (folder / "behaviors.json").read_bytes()
+    with pytest.raises(SystemExit):
+        run_command(
+            eval_command.main,
+            "--baseline=playback",
+            "--env.type=maze2d",
+            "--env.task=small",
+            f"--dataset.root={maze}",
+            f"--behavior_rule={folder / 'behaviors.json'}",
+            f"--output_dir={folder}",
+        )
+    assert "would replace" in capsys.readouterr().err
+    assert (folder / "behaviors.json").read_bytes() == before
+
+
 def test_labels_of_other_rules_are_no_checkpoints():
     """What a maze expects of a start leaves names that are not its own alone."""
     task = Maze2DEnvConfig(task="medium")

@@ -132,12 +132,12 @@ def last_state(episode) -> np.ndarray:
     return episode[STATE][-1]
 
 
-def distance_from_diagonal(episode) -> np.ndarray:
-    """(T, 1) of each state."""
-    return episode[STATE][:, :1] - episode[STATE][:, 1:]
+def turned(episode) -> np.ndarray:
+    """(T, 2) along and across the diagonal."""
+    return episode[STATE] @ np.array([[1.0, 1.0], [1.0, -1.0]])
 
 
-@pytest.mark.parametrize(("function", "count"), [(distance_from_diagonal, 3), (last_state, 1)])
+@pytest.mark.parametrize(("function", "count"), [(turned, 3), (last_state, 1)])
 def test_own_features(function, count):
     """A path or a vector of one's own is compared instead of the states."""
     episodes, labels = three_ways(40, seed=6)
@@ -181,7 +181,7 @@ def test_pace_does_not_change_a_path():
     line = np.linspace(0, 1, 60)[:, None] * np.array([[1.0, 2.0]])
     paused = np.insert(line, 30, np.repeat(line[30:31], 60, axis=0), axis=0)
     assert np.abs(walk(line, 50) - walk(paused, 50)).max() < 0.1
-    assert np.abs(walk(line, 50) - walk(line[::2], 50)).max() < 0.02
+    assert np.abs(walk(line, 50) - walk(line[::2], 50)).max() < 0.05
 
 
 def test_support_finds_the_number_of_clouds():

@@ -7,6 +7,7 @@ from pathlib import Path
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
 
+from lerobot_swr.behaviors import load_behavior_rule
 from lerobot_swr.cli.eval_conflicts import refuse_conflicts
 from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.envs.task import task_of
@@ -71,6 +72,7 @@ class EvalCommand:
         if self.style_sampling is not None:
             check_style_sampling(self.style_sampling)
         self._refuse_conflicts()
+        self._check_rule_file()
         if self.scenes is not None and self.env is not None:
             check_scenes(self.scenes, self.env)
         if self.recorded_starts and self.env is not None:
@@ -86,6 +88,18 @@ class EvalCommand:
                 raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
         if self.output_dir is None:
             self.output_dir = Path("outputs/swr_eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}"
+
+    def _check_rule_file(self) -> None:
+        """See that a file of found behaviours is one, and that the results would not replace it."""
+        if self.behavior_rule is None or not self.behavior_rule.endswith(".json"):
+            return
+        load_behavior_rule(self.behavior_rule)
+        folder = Path(self.behavior_rule).resolve().parent
+        if self.output_dir is not None and self.output_dir.resolve() == folder:
+            raise ValueError(
+                f"output_dir={str(self.output_dir)!r} holds the rule {self.behavior_rule}, which the results "
+                "would replace; choose another folder"
+            )
 
     def _refuse_conflicts(self) -> None:
         """Refuse flags of which one would have no effect beside another."""

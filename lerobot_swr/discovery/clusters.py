@@ -25,7 +25,7 @@ LOOKED_AT = 1000  # episodes, drawn at random, by which the number of groups is 
 CLUSTERED = 10_000  # episodes that are clustered; further ones join the group of the nearest of these
 REFERENCES = 4  # data sets without groups, of each kind
 SUBSAMPLES, SHARE = 8, 0.8
-LEAST_SEPARATION, LEAST_STABILITY = 0.05, 0.85
+LEAST_SEPARATION, LEAST_STABILITY = 0.1, 0.85
 WITHIN_SEPARATION, WITHIN_STABILITY = 0.3, 0.95  # for groups within a group
 SMALLEST_PARENT = 10  # episodes of a group that is looked at by itself
 

@@ -20,6 +20,7 @@ MOVES = 0.02  # least spread within episodes of a dimension that counts as movin
 VARIES = 0.2  # least spread of first states in a dimension that is scene, relative to all frames'
 KEPT = 0.99  # share of the variance that the main directions hold
 MOST_DIRECTIONS = 10
+EPISODES_A_TERM = 8  # of a scene's squares and products, which small datasets cannot tell
 PENALTIES = np.logspace(-1, 4, 12)
 
 Episode = Mapping[str, np.ndarray]
@@ -145,7 +146,7 @@ class Features:
         scaling: Units.
         points: P, points of a path; 1 for vectors.
         scene: Dimensions of the first state that are scene; none where it is not looked at.
-        slope: (scene, P·m) what a unit of them adds to the path.
+        slope: (terms, P·m) what a unit of each adds to the path; see `scene_terms`.
         offset: (P·m,) the mean path (of the scene at the centre).
         directions: (k, P·m) orthonormal main directions of what is left.
     """
@@ -162,7 +163,8 @@ class Features:
         states = self.scaling(self.scaling.source.states(episode))
         ways = self.scaling.ways(states)
         path = ways[:1] if self.points == 1 else walk(ways, self.points)
-        return path.reshape(-1) - self.offset - states[0, self.scene] @ self.slope
+        terms = scene_terms(states[:1, self.scene], len(self.slope))
+        return path.reshape(-1) - self.offset - terms[0] @ self.slope
 
     def embed(self, episode: Episode) -> tuple[np.ndarray, float]:
         """(k,) place along the main directions, and the distance from what these span."""
@@ -200,7 +202,7 @@ class Features:
             scaling,
             int(data["points"]),
             scene,
-            np.array(data["slope"], float).reshape(len(scene), width),
+            np.array(data["slope"], float).reshape(-1, width),
             arrays["offset"],
             np.array(data["directions"], float).reshape(-1, width),
         )
@@ -263,13 +265,33 @@ def fit_features(paths: Paths, kept: np.ndarray, without_scene: bool) -> tuple[F
     """
     flat = paths.paths.reshape(len(paths.paths), -1)
     scene = paths.scene if without_scene else np.array([], int)
-    slope, offset = np.zeros((len(scene), flat.shape[1])), flat[kept].mean(axis=0)
+    linear, quadratic = len(scene), len(scene) * (len(scene) + 3) // 2
+    terms = scene_terms(
+        paths.firsts[:, scene], quadratic if EPISODES_A_TERM * quadratic <= kept.sum() else linear
+    )
+    slope, offset = np.zeros((terms.shape[1], flat.shape[1])), flat[kept].mean(axis=0)
     if len(scene):
-        fit = RidgeCV(alphas=PENALTIES).fit(paths.firsts[kept][:, scene], flat[kept])
+        fit = RidgeCV(alphas=PENALTIES).fit(terms[kept], flat[kept])
         slope, offset = fit.coef_.T, fit.intercept_
-    residuals = flat - offset - paths.firsts[:, scene] @ slope
+    residuals = flat - offset - terms @ slope
     directions = main_directions(residuals[kept])
     return Features(paths.scaling, paths.paths.shape[1], scene, slope, offset, directions), residuals
+
+
+def scene_terms(firsts: np.ndarray, count: int) -> np.ndarray:
+    """What the path is regressed on.
+
+    Args:
+        firsts: (N, s) scene dimensions of first states.
+        count: s for these alone, s (s + 3) / 2 for their squares and products, too.
+
+    Returns:
+        (N, count).
+    """
+    if count == firsts.shape[1]:
+        return firsts
+    first, second = np.triu_indices(firsts.shape[1])
+    return np.concatenate([firsts, firsts[:, first] * firsts[:, second]], axis=1)
 
 
 def main_directions(residuals: np.ndarray) -> np.ndarray:

@@ -14,6 +14,7 @@ from sklearn.neighbors import NearestNeighbors
 
 FAR = 5.0  # robust standard deviations of the logarithm
 FARTHER = 6.0  # the same, for numbers that vary for good reasons, too
+COPY = 0.02  # distance, relative to the size of what is compared, below which episodes count as copies
 NEIGHBOURS = 3  # by which starts and ends are judged: several episodes may begin or end oddly
 LEAST_FACTOR = 1.6  # and at least this many times the median
 SHORT, STILL = 0.35, 0.15  # shares of the median of frames, of the way covered
@@ -86,7 +87,9 @@ def suspicious(
         manner: None for vectors, of which nothing else is known.
         kept: (N,) bool, the episodes that tell what is usual.
     """
-    result = far_beyond(nearest_distance(residuals, kept), kept)
+    size = np.sqrt(np.square(residuals[kept]).sum(axis=1).mean())
+    # Copies of an episode are no measure of what is usual.
+    result = far_beyond(np.maximum(nearest_distance(residuals, kept), COPY * size), kept)
     if manner is None:
         return result
     usual_way, usual_frames = np.median(manner.way[kept]), np.median(manner.frames[kept])
