@@ -137,12 +137,12 @@ def test_a_scene_varies_where_starts_differ_by_more_than_noise():
 
 
 @pytest.mark.parametrize(
-    ("vary", "dim", "sampling", "beta"), [(True, 10, "scene", 2.0), (False, 10, "uniform", 10.0)]
+    ("vary", "dim", "sampling", "beta"), [(True, 10, "scene", 20.0), (False, 10, "uniform", 10.0)]
 )
 def test_options_that_are_left_open_are_chosen_by_how_much_scenes_vary(vary, dim, sampling, beta, caplog):
     """One sentence says so; what is given stays, and is commented."""
     variation = SceneVariation(np.array([0.9 if vary else 0.0, 0.0]), ("goal", "x"))
-    config = WZBCConfig(style_dim=None, style_sampling=None, beta=None, device="cpu")
+    config = WZBCConfig(style_dim=None, style_sampling=None, beta=None, similarity_frame="box", device="cpu")
     caplog.clear()
     with caplog.at_level("INFO"):
         adopt_scene_defaults(config, variation)

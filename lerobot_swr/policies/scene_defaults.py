@@ -21,7 +21,10 @@ def fitting_options(config: ZBCConfig, scenes_vary: bool) -> dict[str, object]:
     few = 4 if embedded else 10 if isinstance(config, WZBCConfig) else 2
     options["style_dim"] = few if scenes_vary else 10
     if isinstance(config, WZBCConfig):
-        options["beta"] = 2.0 if scenes_vary else 10.0
+        # What sees the manner tells partners from others, so these may be chosen narrowly; over raw states a
+        # low beta only mixes manners.
+        sees_manner = config.similarity_frame is not None or config.similarity_features is not None
+        options["beta"] = 20.0 if scenes_vary and sees_manner else 10.0
     return options
 
 
