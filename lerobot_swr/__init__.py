@@ -9,8 +9,17 @@ Reading order, along the way data takes:
 * `lerobot_swr.similarity`, `lerobot_swr.sampling`, `lerobot_swr.styles`: the method.
 * `lerobot_swr.policies`: BC, ZBC and WZBC as LeRobot policies, and the baselines BESO, DDPM-GPT, DDPM-ACT.
 * `lerobot_swr.training`: many seeds at once.
-* `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports.
+* `lerobot_swr.evaluation`: rollouts, behaviours, metrics, pictures, reports; what can be checked.
 * `lerobot_swr.cli`: the ``lerobot-swr-*`` commands.
+
+Where is what:
+
+* algorithm 1: `lerobot_swr.policies.lessons.Relabel` draws the pair (i, j), by
+  `lerobot_swr.sampling.PartnerSampler`; W and ν are those of `lerobot_swr.similarity.distances`.
+* the gradient of a style: `lerobot_swr.policies.style_policy.StylePolicy.loss`, the only place where a style
+  is detached or not.
+* a further backbone, task or check: `lerobot_swr.policies.backbones`, `lerobot_swr.envs.task`,
+  `lerobot_swr.evaluation.checks`.
 
 Importing this package registers the environment, policy and optimizer configurations with LeRobot, and
 shortens one of its log messages (`lerobot_swr.ffmpeg`).

@@ -1,7 +1,7 @@
 """The similarity-weighted sampler: draws whose style a frame teaches (algorithm 1)."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from lerobot_swr.similarity import (
 )
 
 PartnerSampling = Literal["uniform", "weighted"]
+PARTNER_SAMPLINGS: tuple[PartnerSampling, ...] = get_args(PartnerSampling)
 
 PARTNERS = 256  # nearest others that are drawn by their share; the rest are drawn uniformly
 MAX_INSPECTED_STYLES = 64
@@ -226,11 +227,13 @@ def check_probability(p: float) -> None:
         raise ValueError(f"p={p}: the relabelling probability must lie in [0, 1]; the paper uses 0.8")
 
 
-def check_partner_sampling(partner_sampling: str) -> None:
-    """Refuse unknown ways of drawing partners.
+def check_partner_sampling(partner_sampling: str) -> PartnerSampling:
+    """The way of drawing partners of that name.
 
     Raises:
         ValueError: For anything but ``uniform`` and ``weighted``.
     """
-    if partner_sampling not in ("uniform", "weighted"):
-        raise ValueError(f"partner_sampling={partner_sampling!r}: expected 'uniform' or 'weighted'")
+    for known in PARTNER_SAMPLINGS:
+        if known == partner_sampling:
+            return known
+    raise ValueError(f"partner_sampling={partner_sampling!r}: expected 'uniform' or 'weighted'")

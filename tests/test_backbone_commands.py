@@ -17,7 +17,7 @@ from training_command import assert_same_checkpoint, forget_after, train_in_two_
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.evaluation.checkpoint import load_checkpoint
-from lerobot_swr.evaluation.offline import frame_errors
+from lerobot_swr.evaluation.checks.offline import frame_errors
 from lerobot_swr.trajectories import load_trajectories
 
 

@@ -9,7 +9,7 @@ import pytest
 from lerobot.datasets import LeRobotDatasetMetadata
 from sklearn.metrics import adjusted_rand_score
 
-from lerobot_swr.behaviors import load_behavior_rule
+from lerobot_swr.behavior_rules import load_behavior_rule
 from lerobot_swr.cli import behaviors
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.demos.dataset_writer import write_dataset

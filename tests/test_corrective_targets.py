@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 
 from lerobot_swr.corrective.relative_actions import RelativeActions, Units
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
-from lerobot_swr.evaluation.offline import frame_errors
+from lerobot_swr.evaluation.checks.offline import frame_errors
 from lerobot_swr.run_context import running
 from lerobot_swr.styles.extension import add_demonstrations
 

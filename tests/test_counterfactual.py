@@ -9,15 +9,15 @@ from lerobot.configs import PreTrainedConfig
 
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
-from lerobot_swr.evaluation.blending import DIFFERENT, SAME, SHARES, draw_pairs, run_blends
 from lerobot_swr.evaluation.checkpoint import load_checkpoint
-from lerobot_swr.evaluation.counterfactual import (
+from lerobot_swr.evaluation.checks.blend import DIFFERENT, SAME, SHARES, draw_pairs, run_blends
+from lerobot_swr.evaluation.checks.counterfactual import (
     evaluate_counterfactual,
     format_counterfactual,
     path_distance,
     plan_requests,
 )
-from lerobot_swr.evaluation.length_control import evaluate_length_control, frames_after_end
+from lerobot_swr.evaluation.checks.length import evaluate_length_control, frames_after_end
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.trajectories import load_trajectories
 
@@ -80,7 +80,7 @@ def test_length_control_counts_both_kinds_of_episodes_alike():
     far = evaluate_length_control([100, 101, 69, 68], demonstrations, (70, 80))
     assert far.l1 == 2
     assert far.in_band == 0.5
-    with pytest.raises(ValueError, match=r"length_band=\[1, 2\]: .* 60 to 95 frames"):
+    with pytest.raises(ValueError, match=r"check\.band=\[1, 2\]: .* 60 to 95 frames"):
         evaluate_length_control([70], demonstrations, (1, 2))
 
 
@@ -108,7 +108,7 @@ def checkpoint(make_tiny_policy, small_maze_meta, tmp_path):
 
 
 def test_the_commands_write_what_they_measure(checkpoint, small_maze, tmp_path, run_command, capsys):
-    """Counterfactual check, blends and length band through ``lerobot-swr-eval``."""
+    """Three ``--check.type``s with their options; each writes its result and its picture."""
     flags = [
         f"--policy.path={checkpoint}",
         "--env.type=maze2d",
@@ -117,8 +117,9 @@ def test_the_commands_write_what_they_measure(checkpoint, small_maze, tmp_path, 
         f"--dataset.root={small_maze}",
         f"--output_dir={tmp_path / 'out'}",
     ]
-    run_command(eval_command.main, *flags, "--counterfactual=3", "--blend=1")
-    run_command(eval_command.main, *flags, "--n_episodes=4", "--length_band=[1,500]")
+    run_command(eval_command.main, *flags, "--check.type=counterfactual", "--check.starts=3")
+    run_command(eval_command.main, *flags, "--check.type=blend", "--check.pairs=1")
+    run_command(eval_command.main, *flags, "--check.type=length", "--check.band=[1,500]", "--n_episodes=4")
     out = tmp_path / "out"
     counterfactual = json.loads((out / "counterfactual.json").read_text())
     assert counterfactual["n_episodes"] == 6

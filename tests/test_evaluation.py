@@ -12,6 +12,7 @@ from lerobot.scripts import lerobot_eval
 from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.envs.maze2d.behavior import small
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
+from lerobot_swr.evaluation.checks import behaviors as behaviors_check
 from lerobot_swr.evaluation.metrics import histogram, l1_distance
 from lerobot_swr.evaluation.rollouts import StateRecorder
 from lerobot_swr.trajectories import load_trajectories
@@ -102,7 +103,7 @@ def test_rollouts_begin_where_demonstrations_did(
     """One after the other, and again from the first, over batches; with their styles if these are fixed."""
     shown = []
     monkeypatch.setattr(
-        eval_command, "plot_behaviors", lambda path, _, rollouts, *rest: shown.extend(rollouts)
+        behaviors_check, "plot_behaviors", lambda path, _, rollouts, *rest: shown.extend(rollouts)
     )
     policy = make_tiny_policy("bc")
     checkpoint = save_checkpoint(policy, small_maze_meta, tmp_path / "policy")
@@ -121,10 +122,10 @@ def test_recorded_starts_are_refused_where_starts_are_chosen_otherwise(
     run_command, trained_zbc, small_maze, tmp_path, capsys
 ):
     """Perturbed starts are not the recorded ones."""
-    flags = (*ENV, "--recorded_starts=true", "--robustness=true")
+    flags = (*ENV, "--recorded_starts=true", "--check.type=robustness")
     with pytest.raises(SystemExit):
         evaluate(run_command, trained_zbc, small_maze, tmp_path, *flags)
-    assert "--recorded_starts and --robustness exclude each other" in capsys.readouterr().err
+    assert "--recorded_starts: no effect on check.type='robustness'" in capsys.readouterr().err
 
 
 def test_lerobot_eval_runs_the_same_checkpoint(trained_zbc, tmp_path, monkeypatch):
@@ -303,4 +304,7 @@ def test_options_of_rollouts_are_refused_offline(run_command, tmp_path, capsys, 
     given = f"--config_path={file}" if in_file else f"--{key}=100"
     with pytest.raises(SystemExit):
         run_command(eval_command.main, given, f"--policy.path={tmp_path}", f"--dataset.root={tmp_path}")
-    assert f"--{key}: this is about rollouts in an environment" in capsys.readouterr().err
+    assert (
+        f"--{key}: no effect on check.type='offline'; for rollouts in an environment name one"
+        in capsys.readouterr().err
+    )

@@ -25,7 +25,7 @@ from odd_datasets import (
 from safetensors.torch import load_file
 
 from lerobot_swr.policies.backbones.configuration_mlp import MLPConfig
-from lerobot_swr.policies.processor_swr import FloatVectorsProcessorStep
+from lerobot_swr.policies.vector_pipelines import FloatVectorsProcessorStep
 from lerobot_swr.training.configuration_training import SeedsTrainConfig
 from lerobot_swr.training.memory_dataset import MemoryDataset
 from lerobot_swr.training.seed_runs import SeedRuns

@@ -106,7 +106,7 @@ def test_pauses_teach_nothing_and_the_mean_weight_is_one(make_tiny_policy, monke
     batch["episode_index"] = torch.from_numpy(episodes)
     batch["index"] = torch.arange(len(episodes))
     losses, _ = policy.forward(batch, reduction="none")
-    weights = policy.balance(Lesson.of(batch)).weight.numpy()
+    weights = policy.balance(Lesson.of(batch), 1).weight.numpy()
     assert (losses.detach().numpy()[pauses] == 0).all()
     assert (losses.detach().numpy()[~pauses] > 0).all()
     assert weights.mean() == pytest.approx(1)

@@ -257,6 +257,37 @@ def test_continuing_on_the_same_data_keeps_the_styles(make_tiny_policy, small_ma
     )  # a new run draws the numbers of its own seed
 
 
+def shout(observations) -> str:
+    """A behaviour rule: every episode shows the same."""
+    return "HEY"
+
+
+def test_continuing_may_label_the_demonstrations_anew(make_tiny_policy, small_maze_meta, tmp_path, caplog):
+    """With another behaviour rule; named filters that no longer apply are dropped with a message."""
+    policy = make_tiny_policy("zbc")
+    policy.styles.table = policy.styles.table.with_filter("left", "behavior == '10'").with_filter(
+        "long", "length > 1"
+    )
+    folder = save_checkpoint(policy, small_maze_meta, tmp_path / "c")
+    config = PreTrainedConfig.from_pretrained(folder)
+    config.pretrained_path, config.behavior_rule = folder, f"{__name__}:shout"
+    tuned = make_policy(config, ds_meta=small_maze_meta)
+    assert tuned.styles.table.columns["behavior"] == ["HEY"] * 6
+    assert set(tuned.styles.table.filters) >= {"long"}
+    with running(DatasetConfig("local/small_maze"), resuming=True):
+        resumed = make_policy(config, ds_meta=small_maze_meta)
+    assert set(resumed.styles.table.columns["behavior"]) == {"10", "20"}
+
+
+def test_means_are_over_the_episodes_that_are_trained(make_tiny_policy):
+    """The factors of an epoch's frames have mean 1, whatever is left out."""
+    policy = make_tiny_policy("zbc", episodes=[0, 3, 5])
+    lengths = torch.from_numpy(policy.trajectories.lengths[[0, 3, 5]]).float()
+    factors = policy.balance.factors[[0, 3, 5]]
+    torch.testing.assert_close((factors * lengths).sum() / lengths.sum(), torch.tensor(1.0))
+    torch.testing.assert_close(factors * lengths, lengths.mean().expand(3))
+
+
 def test_constant_dimensions_are_centred_not_blown_up(make_tiny_policy, small_maze_meta):
     """The goal never moves; its input is 0, not the rounding error of its mean over 1e-8."""
     policy = make_tiny_policy("bc")

@@ -23,8 +23,8 @@ from lerobot_swr.demos.recipe import Demonstration
 from lerobot_swr.demos.restricted_pickle import load_recording
 from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
+from lerobot_swr.evaluation.checks.replay import evaluate_replays
 from lerobot_swr.evaluation.open_loop import play
-from lerobot_swr.evaluation.replay import evaluate_replays
 from lerobot_swr.trajectories import dimension_names
 
 STATE, SCENE, ACTION = "observation.state", "observation.environment_state", "action"
@@ -171,11 +171,11 @@ def test_without_a_rule_behaviors_are_left_out(maze_recipe):
             ("--env.type=without_start_rule",),
             ("env.type='without_start_rule' cannot be put into a recorded",),
         ),
-        (("--env.type=maze2d", "--n_episodes=7"), ("--baseline=replay", "--n_episodes")),
-        (("--env.type=maze2d", "--robustness=true"), ("--baseline=replay", "--robustness")),
-        (("--env.type=maze2d", "--style_sampling=fixed"), ("--baseline=replay", "--style_sampling")),
+        (("--env.type=maze2d", "--n_episodes=7"), ("check.type='replay'", "--n_episodes")),
+        (("--env.type=maze2d", "--check.type=robustness"), ("baseline='replay'", "'robustness'")),
+        (("--env.type=maze2d", "--style_sampling=fixed"), ("check.type='replay'", "--style_sampling")),
         (("--env.type=d3il", "--env.task=aligning"), ("env.task='aligning'", "'observation.state'")),
-        ((), ("baseline='replay'", "--env.type")),
+        ((), ("check.type='replay'", "--env.type")),
     ],
 )
 def test_what_cannot_be_replayed_is_told_in_one_line(

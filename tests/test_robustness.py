@@ -10,9 +10,9 @@ from lerobot_swr.cli import eval as eval_command
 from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.evaluation.behavior_evaluation import evaluate_behaviors
+from lerobot_swr.evaluation.checks.robustness import perturbed
 from lerobot_swr.evaluation.metrics import median_interval
 from lerobot_swr.evaluation.playback import PlaybackPolicy, playback_checkpoint
-from lerobot_swr.evaluation.robustness import perturbed
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.trajectories import load_trajectories
 
@@ -73,8 +73,13 @@ def test_playback_comes_back_where_blind_replay_does_not(demonstrations):
 
 
 def test_the_command_evaluates_every_perturbation(run_command, small_maze, tmp_path):
-    """--robustness with the baseline: one row per perturbation, none first, each style once."""
-    flags = ("--baseline=playback", "--robustness=true", "--n_episodes=6", f"--dataset.root={small_maze}")
+    """--check.type=robustness with the baseline: one row per perturbation, none first, each style once."""
+    flags = (
+        "--baseline=playback",
+        "--check.type=robustness",
+        "--n_episodes=6",
+        f"--dataset.root={small_maze}",
+    )
     run_command(eval_command.main, *flags, f"--output_dir={tmp_path}", *ENV)
     result = json.loads((tmp_path / "robustness.json").read_text())
     names = [cell["perturbation"] for cell in result["cells"]]
@@ -100,8 +105,13 @@ def test_an_interrupted_evaluation_keeps_what_it_has(run_command, small_maze, tm
             raise RuntimeError("power cut")
         return run_rollouts(*args, **kwargs)
 
-    monkeypatch.setattr("lerobot_swr.evaluation.robustness.run_rollouts", fail_later)
-    flags = ("--baseline=playback", "--robustness=true", "--n_episodes=3", f"--dataset.root={small_maze}")
+    monkeypatch.setattr("lerobot_swr.evaluation.checks.robustness.run_rollouts", fail_later)
+    flags = (
+        "--baseline=playback",
+        "--check.type=robustness",
+        "--n_episodes=3",
+        f"--dataset.root={small_maze}",
+    )
     with pytest.raises(RuntimeError, match="power cut"):
         run_command(eval_command.main, *flags, f"--output_dir={tmp_path}", *ENV)
     result = json.loads((tmp_path / "robustness.json").read_text())
@@ -123,7 +133,7 @@ def test_only_the_given_episodes_are_played_and_compared_with(
     assert sorted(episode["style_episode"] for episode in result["episodes"]) == sorted(chosen * 4)
     assert result["reference_histogram"] == {"10": 0.5, "20": 0.5}
     assert (result["style_fidelity"], result["l1"]) == (1, 0)
-    run_command(eval_command.main, *flags, *more, "--robustness=true", f"--output_dir={tmp_path}")
+    run_command(eval_command.main, *flags, *more, "--check.type=robustness", f"--output_dir={tmp_path}")
     undisturbed = json.loads((tmp_path / "robustness.json").read_text())["cells"][0]
     assert (undisturbed["style_match"], undisturbed["l1"], undisturbed["l1_floor"]) == (1, 0, 0)
 
@@ -143,20 +153,20 @@ def test_playback_of_some_demonstrations_is_that_of_a_dataset_of_them(demonstrat
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--robustness=true", "--counterfactual=3", *ENV), ("--robustness", "--counterfactual")),
-        (("--robustness=true", "--blend=2", *ENV), ("--robustness", "--blend")),
-        (("--robustness=true", "--length_band=[1,2]", *ENV), ("--robustness", "--length_band")),
-        (("--counterfactual=3", "--n_episodes=7", *ENV), ("--counterfactual", "--n_episodes")),
-        (("--counterfactual=3", "--dataset.episodes=[1]", *ENV), ("--counterfactual", "--dataset.episodes")),
-        (("--blend=3", "--style_sampling=fixed", *ENV), ("--blend", "--style_sampling")),
+        (("--check.type=counterfactual", "--n_episodes=7", *ENV), ("--n_episodes", "'counterfactual'")),
+        (("--check.type=counterfactual", "--dataset.episodes=[1]", *ENV), ("--dataset.episodes",)),
+        (("--check.type=blend", "--style_sampling=fixed", *ENV), ("--style_sampling", "'blend'")),
+        (("--check.type=blend", "--policy.style_sampling=fixed", *ENV), ("--policy.style_sampling",)),
+        (("--check.type=length", "--behavior_rule=a:b", *ENV), ("--behavior_rule", "'length'")),
+        (("--check.type=offline", *ENV), ("'offline'", "--env.type")),
+        (("--check.type=replay", *ENV), ("'replay'", "--policy.path")),
         (("--style_sampling=fixed", "--policy.style_sampling=uniform", *ENV), ("--policy.style_sampling",)),
-        (("--baseline=playback", "--policy.type=zbc", *ENV), ("--baseline", "--policy.*")),
-        (("--robustness=true",), ("--robustness", "--env.type")),
-        (("--counterfactual=3", "--batch_size=5"), ("--counterfactual, --batch_size", "--env.type")),
+        (("--baseline=playback", "--policy.type=zbc", *ENV), ("baseline='playback'", "--policy.*")),
+        (("--check.type=robustness",), ("'robustness'", "--env.type")),
     ],
 )
 def test_flags_without_effect_are_refused(run_command, small_maze, tmp_path, capsys, flags, named):
-    """The error names both flags, before anything is loaded."""
+    """The error names the flag and the check, before anything is loaded."""
     path = () if "--baseline=playback" in flags else ("--policy.path=x",)
     with pytest.raises(SystemExit):
         run_command(
@@ -177,7 +187,8 @@ def test_flags_without_effect_are_refused(run_command, small_maze, tmp_path, cap
         (("--baseline=rewind", *ENV), "baseline='rewind': expected 'playback' or 'replay'"),
         (("--baseline=playback", "--policy.path=x", *ENV), "leave out --policy.path"),
         (("--baseline=playback",), "acts in an environment"),
-        (("--baseline=playback", "--blend=3", *ENV), "no styles to blend"),
+        (("--baseline=playback", "--check.type=blend", *ENV), "check.type='blend' does not allow"),
+        (("--baseline=playback", "--check.type=length", "--check.band=[3]", *ENV), "check.band=[3]"),
     ],
 )
 def test_what_the_baseline_cannot_do_is_told(run_command, small_maze, tmp_path, capsys, flags, message):
@@ -185,6 +196,24 @@ def test_what_the_baseline_cannot_do_is_told(run_command, small_maze, tmp_path, 
     with pytest.raises(SystemExit):
         run_command(eval_command.main, *flags, f"--dataset.root={small_maze}", f"--output_dir={tmp_path}")
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flag", "instead"),
+    [
+        ("--robustness=true", "--check.type=robustness"),
+        ("--counterfactual=40", "--check.type=counterfactual --check.starts=40"),
+        ("--blend=40", "--check.type=blend --check.pairs=40"),
+        ("--length_band=[70,80]", "--check.type=length --check.band=[70,80]"),
+    ],
+)
+def test_former_flags_tell_what_they_became(run_command, capsys, flag, instead):
+    """One line, with what to write."""
+    with pytest.raises(SystemExit):
+        run_command(eval_command.main, flag, "--policy.path=x", "--dataset.root=y", *ENV)
+    error = capsys.readouterr().err
+    assert error.strip().count("\n") == 0
+    assert f"{flag.partition('=')[0]} became a check: write {instead}" in error
 
 
 def test_only_doors_ahead_of_the_start_are_expected():

@@ -1,12 +1,14 @@
 """Adam that steps over the rows that move: the same as Adam over all, at the cost of those rows."""
 
 import copy
+import pickle
 
 import pytest
 import torch
 from torch import nn
 
-from lerobot_swr.policies.row_adam import RowAdam
+from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
+from lerobot_swr.policies.row_adam import RowAdam, SettlingAdam
 
 ROWS, DIM = 300, 3
 
@@ -124,3 +126,68 @@ def test_dense_gradients_move_all_rows():
             optimizer.step()
             optimizer.zero_grad()
     torch.testing.assert_close(rows.table, dense.table, rtol=1e-5, atol=1e-6)
+
+
+def test_a_run_goes_on_under_adam_and_comes_back():
+    """What rows saved, Adam goes on from (weight decay or a second process), and rows again from Adam's."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for model, optimizer in ((rows, by_rows), (dense, adam)):
+        train(model, optimizer, range(150))
+    options = {"lr": 1e-2, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 1e-9, "grad_clip_norm": 0.0}
+    groups = [{"params": [rows.layer]}, {"params": [rows.table], "by_rows": True}]
+    between = FusedAdamConfig(**options).build(groups)
+    assert isinstance(between, SettlingAdam)
+    between.load_state_dict(copy.deepcopy(by_rows.state_dict()))
+    for name, exact in adam.state[dense.table].items():
+        close = {"rtol": 0, "atol": 2e-3 * float(exact.max())}
+        torch.testing.assert_close(between.state[rows.table][name], exact, **close)
+    rows.table.grad = None
+    for model, optimizer in ((rows, between), (dense, adam)):
+        train(model, optimizer, range(150, 250))
+    assert "moved" not in between.state[rows.table]
+    again = RowAdam([{"params": [rows.layer]}, {"params": [rows.table], "by_rows": True}], lr=1e-2)
+    again.load_state_dict(copy.deepcopy(between.state_dict()))
+    for model, optimizer in ((rows, again), (dense, adam)):
+        train(model, optimizer, range(250, 350))
+    torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=4e-3)
+
+
+def test_a_frozen_embedding_stays_and_may_be_thawed():
+    """As adapters freeze what they do not train."""
+    model, _ = make(False)
+    model.table.requires_grad_(False)
+    optimizer = RowAdam([{"params": [model.layer]}, {"params": [model.table], "by_rows": True}], lr=1e-2)
+    before = model.table.clone()
+    for thawed in (False, True):
+        model.table.requires_grad_(thawed)
+        optimizer.zero_grad()
+        model.loss(torch.tensor([1, 2]), thawed).backward()
+        optimizer.step()
+        changed = (model.table != before).any(dim=1)
+        assert changed.nonzero().flatten().tolist() == ([1, 2] if thawed else [])
+
+
+@pytest.mark.parametrize("set_to_none", [True, False])
+def test_gradients_that_the_model_forgets_are_forgotten(set_to_none):
+    """With ``model.zero_grad``, too, and without notes that grow from step to step."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for step in range(300):
+        for model, optimizer in ((rows, by_rows), (dense, adam)):
+            sparse = getattr(model.table, "by_rows", False) and model.table.grad is not None
+            model.loss(torch.tensor([step % 7, step % 50]), sparse).backward()
+            optimizer.step()
+            model.zero_grad(set_to_none)
+    torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=4e-3)
+    assert sum(map(len, by_rows._touched[rows.table])) <= 2 * ROWS
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda pair: pickle.loads(pickle.dumps(pair))])
+def test_a_copy_goes_on_as_the_original(copied):
+    """Model and optimizer copied together, or written and read, in the middle of a run."""
+    model, optimizer = make(True)
+    train(model, optimizer, range(100))
+    other, copied_optimizer = copied((model, optimizer))
+    copied_optimizer.zero_grad()
+    for pair in ((model, optimizer), (other, copied_optimizer)):
+        train(*pair, range(100, 200))
+    assert torch.equal(model.table, other.table)

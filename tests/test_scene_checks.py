@@ -187,10 +187,10 @@ def test_the_command_reports_success_fidelity_and_blind_replay(
             "scenes='own': every episode of env.type='maze2d', env.task='medium'",
         ),
         (["--env.type=maze2d", "--env.task=scenes", "--scenes=old"], "scenes='old': expected 'own' or 'new'"),
-        (["--scenes=new"], "--scenes: this is about rollouts in an environment"),
+        (["--scenes=new"], "--scenes: no effect on check.type='offline'; for rollouts in an environment"),
         (
             ["--env.type=maze2d", "--env.task=scenes", "--scenes=new", "--recorded_starts=true"],
-            "--scenes and --recorded_starts exclude each other",
+            "--recorded_starts: no effect on check.type='behaviors' with --scenes=new",
         ),
     ],
 )

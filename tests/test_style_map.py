@@ -12,7 +12,8 @@ import torch
 from conftest import make_batch, save_checkpoint
 
 from lerobot_swr.cli import styles as styles_command
-from lerobot_swr.styles.map import as_script, demonstration_paths, principal_components, write_style_map
+from lerobot_swr.html_pages import as_script, principal_components
+from lerobot_swr.styles.map import demonstration_paths, write_style_map
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import load_trajectories
 

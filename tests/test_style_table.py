@@ -12,7 +12,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy, make_policy
 
-from lerobot_swr.behaviors import dataset_behavior_rule
+from lerobot_swr.behavior_rules import dataset_behavior_rule
 from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.demos.catalog import RECIPES
 from lerobot_swr.demos.dataset_writer import write_dataset

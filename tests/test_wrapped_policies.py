@@ -13,7 +13,7 @@ from lerobot.utils.constants import ACTION
 from styled_policies import KINDS, batch_of, metadata_of, observed
 
 from lerobot_swr.policies.backbones.wrapped_policy import WrappedPolicy
-from lerobot_swr.policies.processor_swr import FloatVectorsProcessorStep
+from lerobot_swr.policies.vector_pipelines import FloatVectorsProcessorStep
 from lerobot_swr.styles.request import StyleRequest
 
 PLACES = {"act": "environment_state", "diffusion": "environment_state", "toy": "state", "smolvla": "state"}

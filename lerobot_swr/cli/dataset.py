@@ -20,7 +20,7 @@ from lerobot_swr.demos.d3il_converter import recorded_recipe
 from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import DatasetSource
-from lerobot_swr.evaluation.replay import run_replay, summarize
+from lerobot_swr.evaluation.checks.replay import run_replay, summarize
 
 REPLAYED_FRAMES = 10_000
 """About as many frames of converted recordings are replayed, of episodes spread over all of them."""

@@ -26,10 +26,13 @@ from lerobot_swr.demos.dataset_writer import write_dataset
 from lerobot_swr.envs.d3il.configuration_d3il import D3ILEnvConfig
 from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
 from lerobot_swr.envs.task import task_of
-from lerobot_swr.evaluation.behavior_evaluation import BehaviorResult, Comparison, compare, write_json
+from lerobot_swr.evaluation.behavior_evaluation import BehaviorResult
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
+from lerobot_swr.evaluation.checks.behaviors import Comparison, compare
 from lerobot_swr.evaluation.plots import plot_behaviors, plot_comparison
 from lerobot_swr.evaluation.report import Picture, Section, Table, write_report
+from lerobot_swr.evaluation.results import write_json
+from lerobot_swr.evaluation.rollouts import RolloutOptions
 from lerobot_swr.installation import unmet_requirements
 from lerobot_swr.progress import Progress
 
@@ -263,7 +266,8 @@ def _compare(cfg: DemoCommand, training: Training, env_cfg: EnvConfig, sampling:
     checkpoint = load_checkpoint(policy_cfg)
     trajectories = load_reference(DatasetSource(root=cfg.output_dir / training.dataset), checkpoint)
     rule = task_of(env_cfg).behavior_rule()
-    return compare(checkpoint, trajectories, env_cfg, rule, n_episodes=cfg.n_episodes, seed=cfg.seed)
+    options = RolloutOptions(n_episodes=cfg.n_episodes, seed=cfg.seed)
+    return compare(checkpoint, trajectories, env_cfg, rule, options)
 
 
 def _row(training: Training, results: dict[str, BehaviorResult]) -> list[str]:

@@ -1,63 +1,53 @@
 """The options of ``lerobot-swr-eval``, checked before anything is loaded."""
 
 import datetime as dt
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from lerobot.configs import PreTrainedConfig, parser
 from lerobot.envs import EnvConfig
 
-from lerobot_swr.behaviors import load_behavior_rule
-from lerobot_swr.cli.eval_conflicts import refuse_conflicts
+import lerobot_swr.evaluation.checks  # noqa: F401  (registers them)
+from lerobot_swr.behavior_rules import load_behavior_rule
 from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import DatasetSource
+from lerobot_swr.evaluation.checks.behaviors import BehaviorsCheck
+from lerobot_swr.evaluation.checks.check import ROLLOUTS, Check
+from lerobot_swr.evaluation.checks.offline import OfflineCheck
+from lerobot_swr.evaluation.checks.replay import ReplayCheck
+from lerobot_swr.evaluation.rollouts import RolloutOptions
 from lerobot_swr.evaluation.scenes import check_scenes
-from lerobot_swr.styles.drawing import check_style_sampling
+
+FORMER = {
+    "robustness": "--check.type=robustness",
+    "counterfactual": "--check.type=counterfactual --check.starts=40",
+    "blend": "--check.type=blend --check.pairs=40",
+    "length_band": "--check.type=length --check.band=[70,80]",
+}
+"""Flags of version 0.1 and what they became."""
 
 
 @dataclass
-class EvalCommand:
+class EvalCommand(RolloutOptions):
     """Options of ``lerobot-swr-eval``."""
 
+    # What to find out: --check.type=behaviors, robustness, counterfactual, blend, offline, length or replay,
+    # each with options of its own. null: behaviors, or offline where no environment is given.
+    check: Check | None = None
     # The demonstrations to compare with (the training dataset, for a style policy).
     dataset: DatasetSource = field(default_factory=DatasetSource)
     # Environment for rollouts; leave it out to evaluate on the dataset's frames.
     env: EnvConfig | None = None
     # Give the checkpoint as --policy.path=FOLDER; other --policy.* flags override its configuration.
     policy: PreTrainedConfig | None = None
-    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback, "replay" plays
-    # every one's recorded actions from its recorded start and says whether data and environment agree.
+    # Instead of a policy: "playback" plays demonstrations of the dataset back with feedback; "replay" is
+    # short for --check.type=replay.
     baseline: str | None = None
-    # Number of rollouts.
-    n_episodes: int = 100
-    # Largest number of environments that run at once.
-    batch_size: int = 100
-    # How styles are drawn: uniform (the paper), stratified (each style once before any again) or fixed; null
-    # keeps the checkpoint's setting.
-    style_sampling: str | None = None
-    # Begin rollout k where the k-th demonstration (of dataset.episodes) began, not where the environment
-    # draws; with style_sampling fixed it has that demonstration's style, too.
-    recorded_starts: bool = False
-    # own: each rollout begins in the recorded scene of the demonstration whose style it uses; new: in a scene
-    # that nobody demonstrated. Blind replay of the demonstrations is measured beside. Of tasks whose episodes
-    # have scenes of their own.
-    scenes: str | None = None
-    # Request every demonstrated behaviour from this many starts, the same for all, instead of n_episodes
-    # rollouts: confusion matrix, control accuracy, distance to the requested demonstrations. 0 does not.
-    counterfactual: int = 0
-    # Blend this many pairs of styles of the same behaviour, and of different ones, instead. 0 does not.
-    blend: int = 0
-    # Roll out n_episodes times under every perturbation of the environment instead: success, style match and
-    # length error, with each style equally often.
-    robustness: bool = False
-    # [shortest, longest] in frames: compare the rollouts' lengths with the demonstrations' in this band.
-    length_band: list[int] | None = None
     # Labels episodes: module:function, or behaviors.json (lerobot-swr-behaviors finds it); null takes the
     # environment's own rule.
     behavior_rule: str | None = None
-    # Seeds the drawing of styles and the environments.
-    seed: int = 1000
     # Where results are written; null makes a folder under outputs/swr_eval.
     output_dir: Path | None = None
     # Rename observations of the environment to the policy's names.
@@ -69,23 +59,18 @@ class EvalCommand:
         Raises:
             ValueError: Naming the offending key and value.
         """
-        if self.style_sampling is not None:
-            check_style_sampling(self.style_sampling)
-        self._refuse_conflicts()
+        super().__post_init__()
+        check = self._find_check()
+        self._refuse_what_has_no_effect(check)
         self._check_rule_file()
         if self.scenes is not None and self.env is not None:
             check_scenes(self.scenes, self.env)
-        if self.recorded_starts and self.env is not None:
+        if self.env is not None and (self.recorded_starts or check.actor == "none"):
             task_of(self.env).start_rule()  # refuses environments that have none
-        self._find_policy()
-        if self.length_band is not None and len(self.length_band) != 2:
-            raise ValueError(f"length_band={self.length_band}: expected [shortest, longest], e.g. [70,80]")
-        for key in ("counterfactual", "blend"):
-            if getattr(self, key) < 0:
-                raise ValueError(f"{key}={getattr(self, key)}: expected a number >= 0")
-        for key in ("n_episodes", "batch_size"):
-            if getattr(self, key) < 1:
-                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
+        if not _overrides("style_sampling"):
+            self.style_sampling = self.style_sampling or check.style_sampling
+        if check.actor != "none" and self.baseline is None:
+            self._find_policy()
         if self.output_dir is None:
             self.output_dir = Path("outputs/swr_eval") / f"{dt.datetime.now():%Y-%m-%d/%H-%M-%S}"
 
@@ -101,56 +86,74 @@ class EvalCommand:
                 "would replace; choose another folder"
             )
 
-    def _refuse_conflicts(self) -> None:
-        """Refuse flags of which one would have no effect beside another."""
-        given = {
-            "robustness": self.robustness,
-            "counterfactual": self.counterfactual > 0,
-            "blend": self.blend > 0,
-            "length_band": self.length_band is not None,
-            "recorded_starts": self.recorded_starts,
-            "scenes": self.scenes is not None,
-            "style_sampling": self.style_sampling is not None,
-            "behavior_rule": self.behavior_rule is not None,
-            "n_episodes": self._is_given("n_episodes"),
-            "batch_size": self._is_given("batch_size"),
-            "dataset.episodes": self.dataset.episodes is not None,
-            "rename_map": bool(self.rename_map),
-            "baseline": self.baseline is not None,
-            "baseline=replay": self.baseline == "replay",
-            "policy.style_sampling": _overrides("style_sampling"),
-            "policy.style_interpolate": _overrides("style_interpolate"),
-            "policy.*": self.policy is not None or bool(_policy_overrides()),
-        }
-        refuse_conflicts([key for key, is_given in given.items() if is_given], self.env is not None)
+    def _find_check(self) -> Check:
+        """The check, and whether its actor is there."""
+        if self.baseline not in (None, "playback", "replay"):
+            raise ValueError(f"baseline={self.baseline!r}: expected 'playback' or 'replay'")
+        if self.check is None:
+            self.check = self._default_check()
+        check, named = self.check, f"check.type={self.check.type!r}"
+        if self.baseline == "replay" and check.actor != "none":
+            raise ValueError(f"baseline='replay' is check.type='replay', not {named}: leave out one of them")
+        if self.baseline == "playback" and check.actor != "any":
+            raise ValueError(
+                f"baseline='playback' takes the place of a policy in an environment, which {named} does not "
+                "allow: leave it out, or choose another check"
+            )
+        if self.env is None and check.needs_env:
+            raise ValueError(f"{named} acts in an environment: name one with --env.type=...")
+        if self.env is not None and not check.needs_env:
+            raise ValueError(f"{named} looks at the dataset's frames: leave out --env.type")
+        policy = self.policy is not None or parser.get_path_arg("policy") or _policy_overrides()
+        if policy and (self.baseline is not None or check.actor == "none"):
+            instead = f"baseline={self.baseline!r}" if self.baseline else named
+            raise ValueError(f"{instead} takes the place of a policy: leave out --policy.path and --policy.*")
+        return check
 
-    def _is_given(self, key: str) -> bool:
-        """Whether an option is on the command line, or a --config_path file sets it to another value."""
-        return parser.parse_arg(key) is not None or getattr(self, key) != getattr(EvalCommand, key)
+    def _default_check(self) -> Check:
+        if self.baseline == "replay":
+            return ReplayCheck()
+        if self.env is not None or self.baseline is not None:
+            return BehaviorsCheck()
+        return OfflineCheck()
+
+    def _refuse_what_has_no_effect(self, check: Check) -> None:
+        """Refuse options that a check does not heed."""
+        if self.style_sampling is not None and _overrides("style_sampling"):
+            raise ValueError(
+                "--style_sampling and --policy.style_sampling say the same: leave out one of them"
+            )
+        heeded, given = set(check.heeds), self._given([*ROLLOUTS, "scenes", "behavior_rule"])
+        given += ["dataset.episodes"] * (self.dataset.episodes is not None)
+        given += ["rename_map"] * bool(self.rename_map)
+        given += [f"policy.{key}" for key in ("style_sampling", "style_interpolate") if _overrides(key)]
+        if "style_sampling" in heeded:
+            heeded |= {"policy.style_sampling", "policy.style_interpolate"}
+        if check.actor != "none" and self.baseline is None:
+            heeded.add("rename_map")
+        about = f"check.type={check.type!r}"
+        if self.scenes is not None and "scenes" in heeded:  # styles and starts are then chosen
+            heeded -= {"recorded_starts", "policy.style_interpolate"}
+            about += f" with --scenes={self.scenes}"
+        useless = [f"--{key}" for key in given if key not in heeded]
+        if useless:
+            raise ValueError(
+                f"{', '.join(useless)}: no effect on {about}"
+                + ("" if check.needs_env else "; for rollouts in an environment name one with --env.type=...")
+            )
+
+    def _given(self, keys: Iterable[str]) -> list[str]:
+        """Which options are on the command line, or set to another value by a --config_path file."""
+        return [
+            key
+            for key in sorted(keys)
+            if parser.parse_arg(key) is not None or getattr(self, key) != getattr(EvalCommand, key)
+        ]
 
     def _find_policy(self) -> None:
         path = parser.get_path_arg("policy")
-        if self.baseline is not None:
-            if self.baseline not in ("playback", "replay"):
-                raise ValueError(f"baseline={self.baseline!r}: expected 'playback' or 'replay'")
-            if path:
-                raise ValueError(
-                    f"baseline={self.baseline!r} takes the place of a policy: leave out --policy.path"
-                )
-            if self.env is None or self.blend:
-                raise ValueError(
-                    f"baseline={self.baseline!r} has no styles to blend and acts in an environment: give "
-                    "--env.type=... and leave out --blend"
-                )
-            if self.baseline == "replay":
-                task_of(self.env).start_rule()  # refuses environments that have none
-            if self.robustness:
-                self.style_sampling = self.style_sampling or "stratified"
-            return
         if not path:
             raise ValueError("policy.path is missing: give the checkpoint's pretrained_model folder")
-        if self.robustness and not _overrides("style_sampling"):
-            self.style_sampling = self.style_sampling or "stratified"
         self.policy = checkpoint_config(path)
         if self.style_sampling is not None and hasattr(self.policy, "style_sampling"):
             self.policy.style_sampling = self.style_sampling
@@ -177,6 +180,21 @@ def checkpoint_config(path: str) -> PreTrainedConfig:
     config = _stored_config(path, _policy_overrides())
     config.pretrained_path = Path(path)
     return config
+
+
+def refuse_former_flags(arguments: Collection[str]) -> None:
+    """Tell what became of flags of version 0.1.
+
+    Args:
+        arguments: As in ``sys.argv``.
+
+    Raises:
+        ValueError: Naming the flag, and what to write instead.
+    """
+    for argument in arguments:
+        name = argument.partition("=")[0].removeprefix("--")
+        if argument.startswith("--") and name in FORMER:
+            raise ValueError(f"--{name} became a check: write {FORMER[name]}")
 
 
 def _stored_config(path: str, overrides: list[str]) -> PreTrainedConfig:

@@ -16,7 +16,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
-from lerobot_swr.behaviors import dataset_behavior_rule
+from lerobot_swr.behavior_rules import dataset_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.configuration import check_checkpoint_path

@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from sklearn.linear_model import RidgeCV
 
-from lerobot_swr.behaviors import load_function
 from lerobot_swr.discovery.paths import walk, walk_all
+from lerobot_swr.user_functions import load_function
 
 POINTS = 50
 MOVES = 0.02  # least spread within episodes of a dimension that counts as moving, relative to all frames'

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lerobot_swr.discovery.discover import Discovery
-from lerobot_swr.styles.map import as_script, principal_components
+from lerobot_swr.html_pages import as_script, principal_components
 from lerobot_swr.trajectories import Trajectories
 from lerobot_swr.whole_files import write_whole
 

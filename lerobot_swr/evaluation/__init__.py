@@ -1,1 +1,1 @@
-"""Rollouts, behaviours, metrics, statistics, pictures and reports."""
+"""Rollouts, behaviours, metrics, checks, statistics, pictures and reports."""

@@ -1,17 +1,13 @@
-"""Behaviour evaluation: compares a policy's rollouts with the demonstrations."""
+"""Figures of a behaviour evaluation: rollouts beside demonstrations."""
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from lerobot.envs import EnvConfig
 
-from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
-from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import (
     Histogram,
     Interval,
@@ -26,16 +22,9 @@ from lerobot_swr.evaluation.metrics import (
     success_entropy,
     success_interval,
 )
-from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
-from lerobot_swr.evaluation.scenes import (
-    SceneKind,
-    SceneResult,
-    evaluate_scenes,
-    format_scenes,
-    run_in_scenes,
-)
+from lerobot_swr.evaluation.rollouts import Rollout
+from lerobot_swr.evaluation.scenes import SceneResult, format_scenes
 from lerobot_swr.trajectories import Trajectories
-from lerobot_swr.whole_files import write_whole
 
 
 @dataclass(frozen=True)
@@ -168,105 +157,10 @@ def evaluate_behaviors(
     )
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A behaviour evaluation and what its pictures show.
-
-    Attributes:
-        result: The figures.
-        demonstrations: Paths (T, 2) of the reference demonstrations and their labels.
-        rollouts: Paths (T, 2) of the rollouts and their labels.
-    """
-
-    result: BehaviorResult
-    demonstrations: list[tuple[np.ndarray, str]]
-    rollouts: list[tuple[np.ndarray, str]]
-
-
-def compare(
-    checkpoint: Checkpoint,
-    trajectories: Trajectories,
-    env_cfg: EnvConfig,
-    rule: BehaviorRule,
-    *,
-    n_episodes: int = 100,
-    batch_size: int = 100,
-    seed: int = 1000,
-    reference_episodes: Sequence[int] | None = None,
-    recorded_starts: bool = False,
-    scenes: SceneKind | None = None,
-) -> Comparison:
-    """Roll a policy out and compare it with its demonstrations.
-
-    Args:
-        checkpoint: The policy.
-        trajectories: The demonstrations.
-        env_cfg: The environment.
-        rule: Labels an episode from its observations.
-        n_episodes: Number of rollouts.
-        batch_size: Largest number of environments that run at once.
-        seed: Seeds the drawing of styles and the environments.
-        reference_episodes: The demonstrations to compare with; None takes all.
-        recorded_starts: Begin where these demonstrations did, one after the other and again from the first,
-            instead of where the environment draws.
-        scenes: ``own`` begins each rollout in the scene of the demonstration whose style it uses, ``new`` in
-            one that nobody demonstrated; either adds blind replay of these demonstrations.
-
-    Raises:
-        MissingRuleError: If the environment cannot be put into a recorded start.
-    """
-    task = task_of(env_cfg)
-    chosen = range(len(trajectories)) if reference_episodes is None else reference_episodes
-    starts = None
-    if recorded_starts:
-        start_of = task.start_rule()
-        starts = [start_of(trajectories.episode(chosen[k % len(chosen)])) for k in range(n_episodes)]
-    demonstrated = [rule(episode) for episode in trajectories.episodes()]
-    found = None
-    if scenes is None:
-        rollouts = run_rollouts(checkpoint, env_cfg, rule, n_episodes, batch_size, seed, starts=starts)
-    else:
-        found = run_in_scenes(
-            checkpoint, trajectories, env_cfg, rule, scenes, n_episodes, batch_size, seed, reference_episodes
-        )
-        rollouts = found.rollouts
-    sampling, drawn = None, None
-    if checkpoint.has_styles:
-        sampling = checkpoint.policy.config.style_sampling
-        drawn = allowed_episodes(checkpoint, len(demonstrated))
-    result = evaluate_behaviors(
-        rollouts,
-        demonstrated,
-        sampling,
-        reference_episodes,
-        drawn,
-        steps_to_end(env_cfg, trajectories),
-        env_cfg,
-    )
-    if found is not None and scenes is not None:
-        result = replace(result, scenes=evaluate_scenes(found, scenes, demonstrated, rule, task))
-    return Comparison(
-        result,
-        [(task.plot_path(trajectories.episode(i)), demonstrated[i]) for i in chosen],
-        [(task.plot_path(rollout.observations), rollout.behavior) for rollout in rollouts],
-    )
-
-
-def allowed_episodes(checkpoint: Checkpoint, n_demonstrations: int) -> list[int] | None:
-    """The demonstrations whose styles a style policy may draw; None where it has none of theirs."""
-    allowed = checkpoint.policy.styles.allowed().tolist()  # type: ignore[union-attr, operator]
-    return [episode for episode in allowed if episode < n_demonstrations] or None
-
-
 def steps_to_end(env_cfg: EnvConfig, trajectories: Trajectories) -> list[int]:
     """Steps of every demonstration until the environment would have ended it."""
     task = task_of(env_cfg)
     return [task.steps_to_end(episode) for episode in trajectories.episodes()]
-
-
-def write_json(path: Path, result: Any, provenance: dict[str, Any]) -> None:
-    """Write a result dataclass and where it comes from, all or nothing."""
-    write_whole(path, json.dumps({**asdict(result), "provenance": provenance}, indent=2) + "\n")
 
 
 def format_result(result: BehaviorResult) -> str:

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.metrics import Histogram, histogram
+from lerobot_swr.whole_files import replacing
 
 MAX_BARS = 24
 MAX_IN_LEGEND = 20  # behaviours
@@ -60,8 +61,7 @@ def plot_behaviors(
     draw_histograms(histograms, reference, shown)
     histograms.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def plot_comparison(
@@ -93,8 +93,7 @@ def plot_comparison(
         lines = [Line2D([], [], color=colors[x], label=x) for x in demonstrated]  # type: ignore[arg-type]
         figure.legend(handles=lines, loc="outside right center", fontsize=8, title="demonstrated")
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
 
 
 def draw_paths(axes: Axes, paths: Paths, colors: Mapping[str, tuple[float, ...]], env_cfg: EnvConfig) -> None:
@@ -157,5 +156,10 @@ def plot_offline(
     along.set(xlabel="share of the episode", ylabel="mean squared action error", yscale="log")
     along.legend([Line2D([], [], color=colors[kind]) for kind in errors], [describe(kind) for kind in errors])
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a picture, all or nothing; the suffix tells the format."""
+    with replacing(path) as unfinished:
+        figure.savefig(unfinished, dpi=110, format=path.suffix[1:])

@@ -1,4 +1,4 @@
-"""Picture of a replay, drawn from its result."""
+"""Picture of a replay."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from lerobot_swr.envs.task import Task
-from lerobot_swr.evaluation.replay import ReplayResult
-from lerobot_swr.evaluation.time_offsets import OFFSETS
+from lerobot_swr.evaluation.plots import save_figure
+from lerobot_swr.evaluation.time_offsets import OFFSETS, ColumnGroup
 
 RECORDED, SUCCEEDED, FAILED = "0.6", "tab:blue", "tab:red"
 LEGEND = {RECORDED: "recorded", SUCCEEDED: "replayed, success", FAILED: "replayed, no success"}
@@ -16,7 +16,8 @@ LEGEND = {RECORDED: "recorded", SUCCEEDED: "replayed, success", FAILED: "replaye
 
 def plot_replay(
     path: Path,
-    result: ReplayResult,
+    succeeded: Sequence[bool],
+    offsets: Sequence[ColumnGroup],
     recorded: Sequence[Mapping[str, np.ndarray]],
     observed: Sequence[Mapping[str, np.ndarray]],
     task: Task,
@@ -26,7 +27,8 @@ def plot_replay(
 
     Args:
         path: Where to write the picture.
-        result: The check.
+        succeeded: Whether each replay did.
+        offsets: Mean deviations of groups of columns at every shift.
         recorded: Observations of every recording.
         observed: Observations of every replay.
         task: Draws the scene and tells the paths.
@@ -37,13 +39,13 @@ def plot_replay(
     task.draw_scene(scene)
     for k, (one, other) in enumerate(zip(recorded, observed, strict=True)):
         scene.plot(*task.plot_path(one).T, color=RECORDED, linewidth=2.2, alpha=0.6)
-        color = SUCCEEDED if result.episodes[k]["success"] else FAILED
+        color = SUCCEEDED if succeeded[k] else FAILED
         scene.plot(*task.plot_path(other).T, color=color, linewidth=0.8)
     for color, label in LEGEND.items():
         scene.plot([], [], color=color, label=label)
     scene.set(xticks=[], yticks=[], aspect="equal")
     figure.legend(*scene.get_legend_handles_labels(), loc="outside lower left", ncols=3, fontsize=8)
-    for group in result.offsets:
+    for group in offsets:
         if group.deviation_by_offset is not None:
             columns = ", ".join(group.columns[:4]) + (" …" if len(group.columns) > 4 else "")
             label = f"{group.feature.removeprefix('observation.')}: {columns}"
@@ -56,5 +58,4 @@ def plot_replay(
     if shifts.lines:
         shifts.legend(fontsize=8)
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path)

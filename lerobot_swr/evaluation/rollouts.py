@@ -15,6 +15,42 @@ from lerobot_swr.envs.observed import as_simulated
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.styles.cookbook import BLENDED
+from lerobot_swr.styles.drawing import check_style_sampling
+from lerobot_swr.trajectories import Trajectories
+
+
+@dataclass(kw_only=True)
+class RolloutOptions:
+    """How many rollouts, and how."""
+
+    # Number of rollouts.
+    n_episodes: int = 100
+    # Largest number of environments that run at once.
+    batch_size: int = 100
+    # How styles are drawn: uniform (the paper), stratified (each style once before any again) or fixed; null
+    # keeps the checkpoint's setting.
+    style_sampling: str | None = None
+    # Begin rollout k where the k-th demonstration (of dataset.episodes) began, not where the environment
+    # draws; with style_sampling fixed it has that demonstration's style, too.
+    recorded_starts: bool = False
+    # own: each rollout begins in the recorded scene of the demonstration whose style it uses; new: in a scene
+    # that nobody demonstrated. Blind replay of the demonstrations is measured beside. Of tasks whose episodes
+    # have scenes of their own.
+    scenes: str | None = None
+    # Seeds the drawing of styles and the environments.
+    seed: int = 1000
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises:
+            ValueError: Naming the offending key and value.
+        """
+        if self.style_sampling is not None:
+            check_style_sampling(self.style_sampling)
+        for key in ("n_episodes", "batch_size"):
+            if getattr(self, key) < 1:
+                raise ValueError(f"{key}={getattr(self, key)}: expected at least 1")
 
 
 @dataclass(frozen=True)
@@ -109,6 +145,38 @@ def _low_dimensional(observations: dict) -> dict[str, np.ndarray]:
     return {k: np.array(v) for k, v in observations.items() if k != "pixels" and isinstance(v, np.ndarray)}
 
 
+def recorded_starts(
+    env_cfg: EnvConfig,
+    trajectories: Trajectories,
+    options: RolloutOptions,
+    episodes: Sequence[int] | None = None,
+) -> list[dict[str, Any]] | None:
+    """Where rollouts begin if they begin where demonstrations did, see `run_rollouts`; None otherwise.
+
+    Args:
+        env_cfg: The environment.
+        trajectories: The demonstrations.
+        options: Say whether, and how many.
+        episodes: The demonstrations to take, one after the other and again from the first; None takes all.
+
+    Raises:
+        MissingRuleError: If the environment cannot be put into a recorded start.
+    """
+    if not options.recorded_starts:
+        return None
+    start_of = task_of(env_cfg).start_rule()
+    chosen = range(len(trajectories)) if episodes is None else episodes
+    return [start_of(trajectories.episode(chosen[k % len(chosen)])) for k in range(options.n_episodes)]
+
+
+def allowed_episodes(checkpoint: Checkpoint, n_demonstrations: int) -> list[int] | None:
+    """The demonstrations whose styles a style policy may draw; None without styles, or if none is theirs."""
+    if not checkpoint.has_styles:
+        return None
+    allowed = checkpoint.policy.styles.allowed().tolist()
+    return [episode for episode in allowed if episode < n_demonstrations] or None
+
+
 def run_rollouts(
     checkpoint: Checkpoint,
     env_cfg: EnvConfig,
@@ -134,7 +202,7 @@ def run_rollouts(
     env_seeds = range(seed, seed + n_episodes) if env_seeds is None else env_seeds
     set_seed(seed)
     if checkpoint.has_styles:
-        checkpoint.policy.styles.restart()  # type: ignore[union-attr, operator]
+        checkpoint.policy.styles.restart()
     env_preprocessor, env_postprocessor = make_env_pre_post_processors(env_cfg, checkpoint.policy.config)
     rollouts: list[Rollout] = []
     while len(rollouts) < n_episodes:

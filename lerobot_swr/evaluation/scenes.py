@@ -68,13 +68,14 @@ class SceneResult:
     replay_fidelity_interval: Interval
 
 
-def check_scenes(kind: str, env_cfg: EnvConfig) -> None:
-    """Refuse an unknown kind of scenes, and an environment without any.
+def check_scenes(kind: str, env_cfg: EnvConfig) -> SceneKind:
+    """The kind of scenes of that name, of an environment that has scenes.
 
     Raises:
         ValueError: Naming the value, or the environment.
     """
-    if kind not in get_args(SceneKind):
+    found: SceneKind | None = next((known for known in get_args(SceneKind) if known == kind), None)
+    if found is None:
         raise ValueError(f"scenes={kind!r}: expected 'own' or 'new'")
     task = task_of(env_cfg)
     if not task.draws_scenes:
@@ -84,6 +85,7 @@ def check_scenes(kind: str, env_cfg: EnvConfig) -> None:
             "aligning)"
         )
     task.start_rule()  # refuses environments that have none
+    return found
 
 
 def run_in_scenes(

@@ -3,7 +3,7 @@
 A style policy (`style_policy`) is a cookbook of styles, a backbone (`backbones`) that learns actions, and the
 steps that make a lesson (`lessons`). The way of a batch in training:
 
-    batch of LeRobot's loop, preprocessed (`processor_swr`): observations, action, episode_index
+    batch of LeRobot's loop, preprocessed (`vector_pipelines`): observations, action, episode_index
       |
       v  StylePolicy.draw                       all random draws are here
     Lesson(batch, weight = 1, episode = i, teaches_style = True)

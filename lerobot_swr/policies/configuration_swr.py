@@ -20,8 +20,8 @@ from lerobot_swr.policies.backbones.policy_traits import PolicyTraits
 from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.policies.backbones.style_place import AUTO, check_style_place
 from lerobot_swr.policies.backbones.traits import Traits
-from lerobot_swr.policies.processor_swr import Pipelines
 from lerobot_swr.policies.state_config import StateConfig
+from lerobot_swr.policies.vector_pipelines import Pipelines
 from lerobot_swr.sampling import check_partner_sampling, check_probability
 from lerobot_swr.similarity import Manner, check_beta, check_normalization
 from lerobot_swr.styles.drawing import check_style_sampling

@@ -41,7 +41,7 @@ class Dynamics:
         labels = CorrectiveLabels(
             self.trajectories,
             self.model,
-            config.corrective,  # type: ignore[arg-type]
+            "demos" if config.corrective == "demos" else "noise",
             config.corrective_scale,
             config.observation_keys,
         )

@@ -82,6 +82,7 @@ class Balance:
 
     Args:
         trajectories: The training dataset, F frames.
+        episodes: Those that are trained on, over which all means are.
         pauses: (F,) bool, frames that are left out; None for none.
         episodes_alike: Whether episodes count alike, rather than frames.
 
@@ -90,16 +91,24 @@ class Balance:
             pauses not counted; or 1.
     """
 
-    def __init__(self, trajectories: Trajectories, pauses: np.ndarray | None, episodes_alike: bool):
+    def __init__(
+        self,
+        trajectories: Trajectories,
+        episodes: Sequence[int],
+        pauses: np.ndarray | None,
+        episodes_alike: bool,
+    ):
         moving = trajectories if pauses is None else trajectories.without(pauses)
         lengths = torch.from_numpy(moving.lengths).to(torch.float32)
-        self.factors = lengths.mean() / lengths if episodes_alike else torch.ones(len(lengths))
-        self._of_frames: Tensor | None = None  # (F,) 0 in a pause, their mean over all frames is 1
+        chosen = torch.tensor(episodes)
+        self.factors = lengths[chosen].mean() / lengths if episodes_alike else torch.ones(len(lengths))
+        self._of_frames: Tensor | None = None  # (F,) 0 in a pause, their mean over the episodes' frames is 1
         if pauses is not None:
+            share = lengths[chosen].sum() / trajectories.lengths[list(episodes)].sum()
             moves = torch.from_numpy(~pauses).to(torch.float32)
-            self._of_frames, self._rows = moves / moves.mean(), FrameRows(trajectories)
+            self._of_frames, self._rows = moves / share, FrameRows(trajectories)
 
-    def __call__(self, lesson: Lesson, steps: int = 1) -> Lesson:
+    def __call__(self, lesson: Lesson, steps: int) -> Lesson:
         """Weight the frames."""
         device = lesson.episode.device
         self.factors = self.factors.to(device)

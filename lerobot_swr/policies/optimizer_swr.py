@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from lerobot.optim.optimizers import AdamConfig, OptimizerConfig, OptimizerParams
 
-from lerobot_swr.policies.row_adam import RowAdam
+from lerobot_swr.policies.row_adam import RowAdam, SettlingAdam
 
 
 @OptimizerConfig.register_subclass("adam_fused")
@@ -24,4 +24,4 @@ class FusedAdamConfig(AdamConfig):
         alone = not (torch.distributed.is_available() and torch.distributed.is_initialized())
         if by_rows and alone and self.weight_decay == 0:
             return RowAdam(groups, **kwargs)
-        return torch.optim.Adam(groups, fused=True, **kwargs)
+        return SettlingAdam(groups, fused=True, **kwargs)

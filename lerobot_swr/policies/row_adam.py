@@ -32,18 +32,36 @@ class RowAdam(torch.optim.Adam):
         super().__init__(params, fused=True, **options)
         self._touched: dict[Tensor, list[Tensor]] = {}  # rows that have a gradient
         self._moving: dict[Tensor, deque[Tensor]] = {}  # rows touched in each of the last steps
-        for param in self._embeddings():
-            param.grad = torch.zeros_like(param)
-            self._touched[param] = []
-            param.register_hook(self._noting(param))
+        self._embeddings()
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Begin anew with what no copy and no file holds: it follows from the rest."""
+        super().__setstate__(state)
+        self._touched = self.__dict__.get("_touched", {})
+        self._moving = {}
 
     def _embeddings(self) -> list[Tensor]:
-        return [p for group in self.param_groups if group.get("by_rows") for p in group["params"]]
+        """The parameters that are stepped by rows, each with a block for its gradient."""
+        groups = [group for group in self.param_groups if group.get("by_rows")]
+        params = [param for group in groups for param in group["params"] if param.requires_grad]
+        for param in params:
+            if param not in self._touched:
+                self._touched[param] = [] if param.grad is None else [_all_rows(param)]
+                param.register_hook(self._noting(param))
+                param.by_rows = True  # who computes gradients may send rows
+                if param.grad is None:
+                    param.grad = torch.zeros_like(param)
+        return params
 
     def _noting(self, param: Tensor) -> Callable[[Tensor], None]:
         def note(gradient: Tensor) -> None:
-            rows = gradient._indices()[0] if gradient.is_sparse else torch.arange(len(param))
-            self._touched[param].append(rows.to(param.device))
+            rows = gradient._indices()[0].to(param.device) if gradient.is_sparse else _all_rows(param)
+            # Someone else may have forgotten the gradient, or have it grow over many batches.
+            touched = [] if param.grad is None else self._touched[param]
+            touched = [*touched, rows]
+            if sum(map(len, touched)) > len(param):
+                touched = [torch.cat(touched).unique()]
+            self._touched[param] = touched
 
         return note
 
@@ -60,14 +78,15 @@ class RowAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
         """A step of Adam."""
-        gradients = {param: param.grad for param in self._embeddings()}
+        gradients = {param: param.grad for param in self._embeddings() if param.grad is not None}
         for param in gradients:
             param.grad = None  # Adam passes over it
         result = super().step(closure)
         for group in self.param_groups:
             for param in group["params"] if group.get("by_rows") else ():
-                param.grad = gradients[param]
-                self._step_rows(param, group)
+                if param in gradients:
+                    param.grad = gradients[param]
+                    self._step_rows(param, group)
         return result
 
     def _step_rows(self, param: Tensor, group: dict[str, Any]) -> None:
@@ -127,19 +146,37 @@ class RowAdam(torch.optim.Adam):
             group["by_rows"] = value
         self._moving = {}
 
-    @torch.no_grad()
     def settle(self) -> None:
         """Bring all rows' states up to now: they are then those of `torch.optim.Adam`."""
-        for group in self.param_groups:
-            for param in group["params"] if group.get("by_rows") else ():
-                if not self.state.get(param):
-                    continue
-                state, rest = self._prepared(param, group), _steps_to_rest(group)
-                missed = (state["step"] - (state["moved"] + (rest - 1))).clamp(min=0)
-                for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
-                    state[name] *= torch.pow(beta, missed)[:, None]
-                del state["moved"]
+        settle(self)
         self._moving = {}
+
+
+class SettlingAdam(torch.optim.Adam):
+    """`torch.optim.Adam` that goes on from what `RowAdam` saved, too."""
+
+    def load_state_dict(self, state_dict: Any) -> None:
+        """Load a state and bring all of its rows up to the step at which it was saved."""
+        super().load_state_dict(state_dict)
+        settle(self)
+
+
+@torch.no_grad()
+def settle(optimizer: torch.optim.Optimizer) -> None:
+    """Make states of Adam of those of `RowAdam`: what decayed since a row's last movement is made up for."""
+    for group in optimizer.param_groups:
+        for param in group["params"]:
+            state = optimizer.state.get(param, {})
+            if "moved" not in state:
+                continue
+            missed = (state["step"] - (state["moved"] + (_steps_to_rest(group) - 1))).clamp(min=0)
+            for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
+                state[name] *= torch.pow(beta, missed)[:, None]
+            del state["moved"]
+
+
+def _all_rows(param: Tensor) -> Tensor:
+    return torch.arange(len(param), device=param.device)
 
 
 def _steps_to_rest(group: dict[str, Any]) -> int:

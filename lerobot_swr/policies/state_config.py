@@ -12,7 +12,7 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from lerobot_swr.configuration import check_dataset_folder, tells_bad_values
 from lerobot_swr.dataset_statistics import Statistics
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
-from lerobot_swr.policies.processor_swr import Pipelines, vector_pipelines
+from lerobot_swr.policies.vector_pipelines import Pipelines, vector_pipelines
 
 
 @dataclass
@@ -136,7 +136,7 @@ class StateConfig(PreTrainedConfig):
             stats: The dataset's statistics.
             meta: The dataset's metadata.
         """
-        return vector_pipelines(self, stats)
+        return vector_pipelines(self, self.dimensions, stats)
 
     def validate_features(self) -> None:
         """Check that the dataset has what the policy needs.

@@ -1,6 +1,8 @@
 """What of a checkpoint a policy takes over, given the dataset that it goes on with."""
 
 import logging
+from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -9,6 +11,7 @@ from lerobot_swr.policies.configuration_swr import ZBCConfig
 from lerobot_swr.policies.training_data import TrainingData
 from lerobot_swr.random_streams import StepGenerator
 from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.filters import FilterError
 from lerobot_swr.styles.selection import StyleSelection
 from lerobot_swr.styles.table import TABLE_FILE, StyleTable
 
@@ -81,6 +84,9 @@ def with_own_styles(
 def adopt_table(styles: StyleCookbook, stored: StyleTable | None, data: TrainingData | None) -> None:
     """Take the checkpoint's table, unless it describes another dataset than the policy's.
 
+    A run that starts from a checkpoint of its own dataset keeps columns and named filters, and has those
+    columns anew for which it asks (``behavior_rule``, ``style_metrics``).
+
     Raises:
         ValueError: If the table is not that of the checkpoint.
     """
@@ -95,12 +101,28 @@ def adopt_table(styles: StyleCookbook, stored: StyleTable | None, data: Training
                 f"{TABLE_FILE} has {len(stored)} rows, the checkpoint {len(styles)} styles; copy the "
                 "checkpoint again"
             )
-        styles.table = stored
+        asked = styles.table
+        if data is not None and not data.run.resuming and asked is not None and len(asked) == len(stored):
+            styles.table = _renewed(stored, asked, cast(ZBCConfig, data.config).behavior_rule is not None)
+        else:  # the run goes on, or the table has rows for episodes of other datasets
+            styles.table = stored
     elif styles.table is None:
         logger.warning(
             "This checkpoint has no table of its demonstrations: filters are not available. Make it with "
             "lerobot-swr-styles CHECKPOINT --dataset.root=DATASET"
         )
+
+
+def _renewed(stored: StyleTable, asked: StyleTable, has_rule: bool) -> StyleTable:
+    """A checkpoint's table with the columns that a run asks for, and the named filters that still apply."""
+    new = {name: values for name, values in asked.columns.items() if has_rule or name != "behavior"}
+    renewed = replace(asked, columns={**asked.columns, **stored.columns, **new})
+    for name, text in stored.filters.items():
+        try:
+            renewed = renewed.with_filter(name, text)
+        except FilterError as error:
+            logger.warning("The named filter %r is dropped: %s", name, error)
+    return renewed
 
 
 def select_styles(styles: StyleCookbook, config: ZBCConfig) -> None:

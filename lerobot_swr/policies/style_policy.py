@@ -26,6 +26,7 @@ from lerobot_swr.policies.training_data import (
     make_table,
 )
 from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.styles.encoding import ActionErrors, Imitation
 from lerobot_swr.styles.held_out import HeldOutStyles
 from lerobot_swr.trajectories import Trajectories
@@ -74,7 +75,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         self.balance: Balance | None = None
         if dataset_meta is not None:
             self.data = data = TrainingData.read(config, dataset_meta)
-            self.balance = Balance(data.trajectories, data.pauses, config.balance_episodes)
+            self.balance = Balance(data.trajectories, data.run.episodes, data.pauses, config.balance_episodes)
             if isinstance(config, ZBCConfig):
                 adopt_scene_defaults(config, data.scene_variation)
             config.traits.adopt(config, data.trajectories.columns, data.trajectories.lengths)
@@ -115,7 +116,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             config.num_episodes + config.num_added_styles,
             config.style_dim,
             config.style_init_scale,
-            config.style_sampling or "uniform",  # type: ignore[arg-type]
+            check_style_sampling(config.style_sampling or "uniform"),
             config.style_selection,
             config.observation_dim,
             config.near_scenes,
@@ -229,7 +230,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
     def _held_out_lesson(self, batch: dict[str, Any]) -> Lesson:
         lesson = Lesson.of(batch)
         if self.balance is not None:
-            lesson = self.balance(lesson)
+            lesson = self.balance(lesson, 1)
         return replace(lesson, batch=self._as_outputs(batch))
 
     def _held_out_styles(self, batch: dict[str, Any]) -> Tensor | None:

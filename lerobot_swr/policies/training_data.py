@@ -19,12 +19,13 @@ from lerobot_swr.dataset_statistics import usable_statistics
 from lerobot_swr.pauses import pause_frames
 from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
 from lerobot_swr.policies.demonstration_frames import DemonstrationFrames, demonstration_frames
-from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors, vector_pipelines
+from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.policies.state_config import StateConfig
+from lerobot_swr.policies.vector_pipelines import vector_pipelines
 from lerobot_swr.run_context import RunContext
-from lerobot_swr.sampling import PartnerSampler
+from lerobot_swr.sampling import PartnerSampler, check_partner_sampling
 from lerobot_swr.scene_variation import SceneVariation, scene_variation
-from lerobot_swr.similarity import Similarity, similarity_of
+from lerobot_swr.similarity import Similarity, check_normalization, similarity_of
 from lerobot_swr.styles.embedding import MannerEmbedding
 from lerobot_swr.styles.encoding import Frames
 from lerobot_swr.styles.table import LABELLED_BY, OUTCOMES, StyleTable, make_nearest_table
@@ -244,7 +245,7 @@ class TrainingData:
 
     def _prepared(self, columns: Mapping[str, np.ndarray], rows: np.ndarray) -> Frames:
         """Some rows of columns of numbers, as batches bring them."""
-        preprocessor, _ = vector_pipelines(self.config, self.meta.stats)
+        preprocessor, _ = vector_pipelines(self.config, self.config.dimensions, self.meta.stats)
         keys = [*self.config.observation_keys, ACTION]
         batch = preprocessor({key: torch.from_numpy(columns[key][rows]) for key in keys})
         return {key: batch[key] for key in keys}
@@ -267,8 +268,8 @@ def make_sampler(config: WZBCConfig, data: TrainingData) -> PartnerSampler:
         np.array(data.run.episodes),
         config.beta,
         config.p,
-        config.similarity_normalization,  # type: ignore[arg-type]
-        config.partner_sampling,  # type: ignore[arg-type]
+        check_normalization(config.similarity_normalization),
+        check_partner_sampling(config.partner_sampling),
     )
 
 

@@ -4,19 +4,11 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from lerobot_swr.evaluation.report import Table
+from lerobot_swr.reproduction.cell_texts import INTERVALS, NOTHING, floor, l1, rollouts, share, steps
+from lerobot_swr.reproduction.robustness_tables import PERTURBATIONS
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
 from lerobot_swr.reproduction.suites import UNPERTURBED
 from lerobot_swr.reproduction.summary import Summary
-from lerobot_swr.reproduction.tables import (
-    INTERVALS,
-    NOTHING,
-    PERTURBATIONS,
-    floor,
-    l1,
-    rollouts,
-    share,
-    steps,
-)
 
 
 def length_error(summary: Summary) -> str:

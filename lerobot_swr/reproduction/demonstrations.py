@@ -18,7 +18,7 @@ from lerobot_swr.demos.recipe import DatasetRecipe
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.behavior_evaluation import steps_to_end
 from lerobot_swr.evaluation.checkpoint import DatasetSource
-from lerobot_swr.evaluation.length_control import frames_after_end
+from lerobot_swr.evaluation.checks.length import frames_after_end
 from lerobot_swr.reproduction.cells import Cell, Labels, Store
 from lerobot_swr.trajectories import Trajectories, load_trajectories
 

@@ -11,7 +11,7 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from lerobot_swr.envs.task import task_of
-from lerobot_swr.evaluation.length_control import BIN_WIDTH
+from lerobot_swr.evaluation.checks.length import BIN_WIDTH
 from lerobot_swr.evaluation.metrics import histogram
 from lerobot_swr.evaluation.plots import (
     behavior_colors,

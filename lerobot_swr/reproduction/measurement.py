@@ -23,6 +23,7 @@ from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import environment, short_path
 from lerobot_swr.reproduction.settings import MAX_ROLLOUTS
 from lerobot_swr.reproduction.training import checkpoint_folder
+from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.whole_files import write_whole
 
 BATCH_SIZE = 100  # environments that run at once
@@ -63,7 +64,7 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     definition, source = cell.definition, DatasetSource(root=dataset)
     if cell.needs is None:
         trajectories = load_demonstrations(source.metadata())
-        checkpoint = playback_checkpoint(trajectories, protocol)  # type: ignore[arg-type]
+        checkpoint = playback_checkpoint(trajectories, check_style_sampling(protocol))
     else:
         folder = checkpoint_folder(cell.needs, store, seed)
         checkpoint = load_policy(folder, protocol, definition["style_filter"])
@@ -90,7 +91,7 @@ def _part(cell: Cell, store: Store, dataset: Path, seed: int, protocol: str) -> 
     drawn = rollouts if definition["paths"] else []
     return {
         "rollouts": columns,
-        "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,  # type: ignore[union-attr, operator]
+        "allowed": checkpoint.policy.styles.allowed().tolist() if filtered else None,
         "paths": [short_path(task.plot_path(rollout.observations)) for rollout in drawn],
     }
 

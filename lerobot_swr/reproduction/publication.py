@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_swr.reproduction import figures, paper, tables
+from lerobot_swr.reproduction import cell_texts, figures, paper
 from lerobot_swr.reproduction.stored_results import StoredCell, load_suites
 from lerobot_swr.reproduction.suites import UNPERTURBED
 from lerobot_swr.whole_files import write_whole
@@ -158,10 +158,10 @@ def _readme_row(cell: StoredCell) -> tuple[str, ...]:
         cell.labels.dataset.removeprefix("medium_maze-").removeprefix("d3il_"),
         cell.labels.policy,
         f"{cell.training['steps']:,}",
-        tables.rollouts(uniform),
-        tables.NOTHING if stratified is None else tables.l1(stratified).replace("\n", " "),
-        f"{uniform.l1:.3f} ({tables.floor(uniform)})".replace("\n", " "),
+        cell_texts.rollouts(uniform),
+        cell_texts.NOTHING if stratified is None else cell_texts.l1(stratified).replace("\n", " "),
+        f"{uniform.l1:.3f} ({cell_texts.floor(uniform)})".replace("\n", " "),
         f"{success.mean:.3f} {success.interval:.3f}",
-        tables.NOTHING if fidelity is None else f"{fidelity.mean:.3f}",
-        tables.quoted(paper.table1(cell.labels.dataset, cell.policy)).replace("\n", " "),
+        cell_texts.NOTHING if fidelity is None else f"{fidelity.mean:.3f}",
+        cell_texts.quoted(paper.table1(cell.labels.dataset, cell.policy)).replace("\n", " "),
     )

@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from lerobot_swr.evaluation.report import Picture, Section, write_markdown, write_report
-from lerobot_swr.reproduction import contracting_tables, figures, scene_tables, tables
+from lerobot_swr.reproduction import (
+    cell_texts,
+    contracting_tables,
+    figures,
+    robustness_tables,
+    scene_tables,
+    tables,
+)
 from lerobot_swr.reproduction.paper import SOURCE
 from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
 from lerobot_swr.reproduction.stored_results import (
@@ -124,9 +131,9 @@ def _robustness(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
         yield Section(
             f"Robustness: {name}",
             [
-                tables.robustness(suite, name),
-                tables.robustness_differences(suite, name),
-                *map(tables.teaching, teaching),
+                robustness_tables.robustness(suite, name),
+                robustness_tables.robustness_differences(suite, name),
+                *map(robustness_tables.teaching, teaching),
             ],
             [
                 Picture(
@@ -232,7 +239,7 @@ def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
                     rho,
                 ),
             ]
-            shown.append(tables.teaching(cell))
+            shown.append(robustness_tables.teaching(cell))
         maps = suite.of_kind("styles", name)
         if maps:
             picture = pictures / f"styles-{name}.png"
@@ -253,8 +260,8 @@ def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
             figures.plot_sweep(picture, swept)
             drawn.append(
                 Picture(
-                    f"Effect of β and p on WZBC, {tables.steps(swept[0])} training steps × batch, "
-                    f"{tables.rollouts(swept[0].best)} seeds × rollouts; intervals in the table.",
+                    f"Effect of β and p on WZBC, {cell_texts.steps(swept[0])} training steps × batch, "
+                    f"{cell_texts.rollouts(swept[0].best)} seeds × rollouts; intervals in the table.",
                     picture,
                 )
             )

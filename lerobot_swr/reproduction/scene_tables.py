@@ -1,10 +1,10 @@
 """The table of the suite scenes: own scenes, new ones, and blind replay."""
 
 from lerobot_swr.evaluation.report import Table
+from lerobot_swr.reproduction.cell_texts import NOTHING, rollouts, share, steps
 from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults
 from lerobot_swr.reproduction.suites import SCENE_CONDITIONS
 from lerobot_swr.reproduction.summary import Rate, rate
-from lerobot_swr.reproduction.tables import NOTHING, rollouts, share, steps
 
 
 def scenes(suite: SuiteResults, dataset: str) -> Table:

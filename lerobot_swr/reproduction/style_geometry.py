@@ -8,12 +8,12 @@ from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE
 from scipy.spatial import KDTree
 
 from lerobot_swr.envs.task import task_of
+from lerobot_swr.html_pages import principal_components
 from lerobot_swr.reproduction.cells import Cell, Store
 from lerobot_swr.reproduction.demonstrations import environment, load_low_dimensional
 from lerobot_swr.reproduction.measurement import load_policy
 from lerobot_swr.reproduction.training import checkpoint_folder
 from lerobot_swr.similarity import Dissimilarity, similarity_of, similarity_weights
-from lerobot_swr.styles.map import principal_components
 from lerobot_swr.trajectories import Trajectories
 
 GRID = 40  # cells per side of the picture of eq. 3

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lerobot_swr.evaluation.length_control import TOLERANCE, length_bins
+from lerobot_swr.evaluation.checks.length import TOLERANCE, length_bins
 from lerobot_swr.evaluation.metrics import (
     Floor,
     Histogram,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from huggingface_hub import HfApi, ModelCard, ModelCardData
 
+from lerobot_swr.html_pages import principal_components
 from lerobot_swr.installation import installed_versions
 from lerobot_swr.sharing.markdown import code, escaped, table
 from lerobot_swr.sharing.measures import ResultFile
 from lerobot_swr.sharing.pictures import draw_groups
 from lerobot_swr.styles.filters import describe_column
-from lerobot_swr.styles.map import principal_components
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.whole_files import write_whole
 

@@ -1,13 +1,14 @@
 """The definition: distances of demonstrations, dissimilarities ν and weights W."""
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from scipy.spatial.distance import squareform
 
 Normalization = Literal["row", "global"]
+NORMALIZATIONS: tuple[Normalization, ...] = get_args(Normalization)
 Episodes = int | np.ndarray
 """One episode or an array of them."""
 
@@ -84,14 +85,16 @@ def similarity_weights(nu: np.ndarray, beta: float) -> np.ndarray:
     return np.exp(-beta * np.asarray(nu))
 
 
-def check_normalization(normalization: str) -> None:
-    """Refuse unknown normalizations.
+def check_normalization(normalization: str) -> Normalization:
+    """The normalization of that name.
 
     Raises:
         ValueError: For anything but ``row`` and ``global``.
     """
-    if normalization not in ("row", "global"):
-        raise ValueError(f"normalization={normalization!r}: expected 'row' or 'global'")
+    for known in NORMALIZATIONS:
+        if known == normalization:
+            return known
+    raise ValueError(f"normalization={normalization!r}: expected 'row' or 'global'")
 
 
 def check_beta(beta: float) -> None:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from lerobot_swr.behaviors import load_function
 from lerobot_swr.object_poses import Names, find_poses, hand_of, into_frame, object_of
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.user_functions import load_function
 
 MANNER = "manner"  # the column of what is compared, where that is no feature of the dataset
 

@@ -83,8 +83,8 @@ class StyleCookbook(nn.Module):
     def forward(self, episodes: Tensor) -> Tensor:
         """(B, style_dim) styles of the (B,) `episodes`, to be trained."""
         weight = self.embedding.weight
-        # Where an optimizer keeps a block for the gradient, few rows are added to it instead of all.
-        sparse = weight.is_leaf and weight.grad is not None and not weight.grad.is_sparse
+        # To an optimizer that says so, and keeps a block for the gradient, go few rows instead of all.
+        sparse = getattr(weight, "by_rows", False) and weight.grad is not None
         return nn.functional.embedding(episodes, weight, sparse=sparse)
 
     def check_trained(self, episodes: Tensor) -> None:

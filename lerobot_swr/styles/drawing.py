@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 StyleSampling = Literal["uniform", "stratified", "fixed", "scene"]
-SAMPLINGS = get_args(StyleSampling)
+SAMPLINGS: tuple[StyleSampling, ...] = get_args(StyleSampling)
 
 
 class StyleDrawing:
@@ -55,12 +55,14 @@ def one_of_each(choices: Sequence[Tensor]) -> Tensor:
     return torch.cat([choice[place] for choice, place in zip(choices, places, strict=True)])
 
 
-def check_style_sampling(sampling: str) -> None:
-    """Refuse unknown ways of drawing styles.
+def check_style_sampling(sampling: str) -> StyleSampling:
+    """The way of drawing styles of that name.
 
     Raises:
         ValueError: For anything but ``uniform``, ``stratified``, ``fixed`` and ``scene``.
     """
-    if sampling not in SAMPLINGS:
-        known = ", ".join(map(repr, SAMPLINGS[:-1]))
-        raise ValueError(f"style_sampling={sampling!r}: expected {known} or {SAMPLINGS[-1]!r}")
+    for known in SAMPLINGS:
+        if known == sampling:
+            return known
+    names = ", ".join(map(repr, SAMPLINGS[:-1]))
+    raise ValueError(f"style_sampling={sampling!r}: expected {names} or {SAMPLINGS[-1]!r}")

@@ -11,7 +11,7 @@ import torch
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor, nn
 
-from lerobot_swr.behaviors import dataset_behavior_rule, is_metric_file, listed, load_style_metrics
+from lerobot_swr.behavior_rules import dataset_behavior_rule
 from lerobot_swr.progress import Progress
 from lerobot_swr.similarity import Similarity, similarity_by
 from lerobot_swr.styles.cookbook import StyleCookbook
@@ -19,6 +19,7 @@ from lerobot_swr.styles.encoding import ENCODING_STEPS, STARTS, Frames, Imitatio
 from lerobot_swr.styles.filters import names_in
 from lerobot_swr.styles.table import MAX_NEIGHBOURS, OUTCOME_COLUMNS, OUTCOMES, StyleTable, make_style_table
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.user_functions import is_metric_file, listed, load_style_metrics
 
 CHUNK = 8  # episodes encoded at once; bounds memory
 

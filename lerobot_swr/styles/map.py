@@ -1,7 +1,6 @@
 """The interactive map of a cookbook: one HTML file that opens offline."""
 
 import importlib.util
-import json
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import numpy as np
 from lerobot.utils.constants import OBS_STATE
 
+from lerobot_swr.html_pages import as_script, principal_components
 from lerobot_swr.installation import MissingExtraError
 from lerobot_swr.styles.filters import column_kind
 from lerobot_swr.styles.table import StyleTable
@@ -16,25 +16,6 @@ from lerobot_swr.trajectories import Trajectories
 from lerobot_swr.whole_files import write_whole
 
 MAX_PATH_POINTS = 120
-
-
-def principal_components(points: np.ndarray) -> np.ndarray:
-    """(N, 2) coordinates of (N, d) points along their two directions of largest variance.
-
-    Each direction points to where its largest component is positive, so that a map looks the same each time.
-    """
-    centred = points - points.mean(axis=0)
-    _, _, directions = np.linalg.svd(centred, full_matrices=False)
-    directions = (
-        directions[:2] * np.sign(directions[:2][range(len(directions[:2])), _largest(directions)])[:, None]
-    )
-    flat = np.zeros((len(points), 2))
-    flat[:, : len(directions)] = centred @ directions.T
-    return flat
-
-
-def _largest(directions: np.ndarray) -> np.ndarray:
-    return np.abs(directions[:2]).argmax(axis=1)
 
 
 def project_styles(styles: np.ndarray) -> dict[str, np.ndarray]:
@@ -58,15 +39,6 @@ def demonstration_paths(trajectories: Trajectories, episodes: list[int]) -> list
         chosen = np.linspace(0, length - 1, min(length, MAX_PATH_POINTS)).round().astype(int)
         paths.append(flat[starts[i] + chosen])
     return paths
-
-
-def as_script(data: Any) -> str:
-    """Data as an expression that may stand in a page's script element, whatever strings it holds.
-
-    There, ``</script`` and ``<!--`` mean something even within a string.
-    """
-    text = json.dumps(data)  # all ASCII
-    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def _plotly_js() -> str:

@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lerobot_swr.behaviors import is_metric_file, listed
 from lerobot_swr.styles.filters import Value, column_kind
+from lerobot_swr.user_functions import is_metric_file, listed
 
 EPISODE_NAMES = ("episode_index", "episode", "episode_id", "episode_idx", "ep_idx")
 

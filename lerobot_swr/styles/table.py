@@ -19,12 +19,14 @@ from huggingface_hub import HfApi, hf_hub_download
 from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 from lerobot.utils.constants import OBS_ENV_STATE, OBS_STATE, REWARD
 
-from lerobot_swr.behaviors import BehaviorRule, dataset_behavior_rule, load_style_metrics
+from lerobot_swr.behavior_rules import dataset_behavior_rule
+from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.observed import SIMULATED, as_simulated
 from lerobot_swr.similarity import Similarity
 from lerobot_swr.styles.filters import Value, column_kind, select
 from lerobot_swr.styles.metric_files import read_metric_files
 from lerobot_swr.trajectories import Trajectories
+from lerobot_swr.user_functions import load_style_metrics
 from lerobot_swr.whole_files import replacing
 
 TABLE_FILE = "styles.parquet"

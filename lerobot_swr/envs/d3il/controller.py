@@ -79,9 +79,7 @@ def tool_kinematics(
         jacobian: (6, 7) output, linear over angular velocity.
     """
     position[:] = 0.0
-    rotation[:] = 0.0
-    for i in range(3):
-        rotation[i, i] = 1.0
+    rotation[:] = np.eye(3)
     for joint in range(7):
         for row in range(3):
             position[row] += (
@@ -226,10 +224,7 @@ def clipped_solve(matrix: np.ndarray, vector: np.ndarray) -> None:
     for i in range(6):
         trace += matrix[i, i]
     lower = np.empty((6, 6))
-    well_conditioned = trace < _MAX_SINGULAR_VALUE and _cholesky_solve(
-        matrix, _MIN_SINGULAR_VALUE, lower, vector, False
-    )
-    if well_conditioned:
+    if trace < _MAX_SINGULAR_VALUE and _cholesky_solve(matrix, _MIN_SINGULAR_VALUE, lower, vector, False):
         _cholesky_solve(matrix, 0.0, lower, vector, True)
     else:
         _jacobi_solve(matrix, vector)

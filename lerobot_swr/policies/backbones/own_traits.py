@@ -11,7 +11,7 @@ from lerobot_swr.policies.backbones.backbone import Backbone
 from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.policies.backbones.traits import Traits
 from lerobot_swr.policies.optimizer_swr import FusedAdamConfig
-from lerobot_swr.policies.processor_swr import Pipelines, vector_pipelines
+from lerobot_swr.policies.vector_pipelines import Pipelines, vector_pipelines
 
 if TYPE_CHECKING:
     from lerobot_swr.policies.configuration_swr import BCConfig
@@ -53,7 +53,7 @@ class OwnTraits(Traits):
 
     def processors(self, config: "BCConfig", stats: Statistics | None, meta: Any | None) -> Pipelines:
         """LeRobot's default pipelines, on vectors."""
-        return vector_pipelines(config, stats)
+        return vector_pipelines(config, config.dimensions, stats)
 
     def make(
         self, config: "BCConfig", style_dim: int, stats: Statistics | None, meta: Any | None

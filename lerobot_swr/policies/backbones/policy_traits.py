@@ -17,8 +17,8 @@ from lerobot_swr.policies.backbones.style_place import AUTO, check_takes_style, 
 from lerobot_swr.policies.backbones.style_probe import invented_batch
 from lerobot_swr.policies.backbones.traits import Traits
 from lerobot_swr.policies.backbones.wrapped_policy import WrappedPolicy, make_policy_of
-from lerobot_swr.policies.processor_swr import FloatVectorsProcessorStep, Pipelines, prepared_statistics
 from lerobot_swr.policies.state_config import StateConfig
+from lerobot_swr.policies.vector_pipelines import FloatVectorsProcessorStep, Pipelines, prepared_statistics
 
 if TYPE_CHECKING:
     from lerobot_swr.policies.configuration_swr import BCConfig

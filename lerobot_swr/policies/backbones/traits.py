@@ -9,7 +9,7 @@ from lerobot.optim import LRSchedulerConfig, OptimizerConfig
 
 from lerobot_swr.dataset_statistics import Statistics
 from lerobot_swr.policies.backbones.backbone import Backbone
-from lerobot_swr.policies.processor_swr import Pipelines
+from lerobot_swr.policies.vector_pipelines import Pipelines
 
 if TYPE_CHECKING:
     from lerobot_swr.policies.configuration_swr import BCConfig

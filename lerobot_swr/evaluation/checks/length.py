@@ -1,13 +1,20 @@
 """Control of the episode length: do rollouts keep to a band of lengths, as the demonstrations in it do?"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from lerobot.envs import EnvConfig
+from matplotlib.figure import Figure
 
 from lerobot_swr.envs.task import task_of
+from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.checks.check import ROLLOUTS, Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import Histogram, Interval, histogram, l1_distance, l1_floor
+from lerobot_swr.evaluation.plots import save_figure
+from lerobot_swr.evaluation.rollouts import allowed_episodes, recorded_starts, run_rollouts
 from lerobot_swr.trajectories import Trajectories
 
 BIN_WIDTH = 5  # steps
@@ -73,7 +80,7 @@ def evaluate_length_control(
     reference = [n for n in demonstration_lengths if low <= n <= high]
     if not reference:
         raise ValueError(
-            f"length_band={[low, high]}: no demonstration has such a length; they have "
+            f"check.band={[low, high]}: no demonstration has such a length; they have "
             f"{min(demonstration_lengths)} to {max(demonstration_lengths)} frames"
         )
     lengths = [n + after_end for n in rollout_lengths]
@@ -108,3 +115,79 @@ def format_length_control(result: LengthControlResult) -> str:
         f"                {result.in_band:.3f} of {result.n_episodes} rollouts in that band ± {TOLERANCE} "
         f"steps (counting {result.frames_after_end} frames that demonstrations record after the end)"
     )
+
+
+def plot_length_control(path: Path, result: LengthControlResult, title: str) -> None:
+    """Histograms of lengths: demonstrations in the band and rollouts.
+
+    Args:
+        path: Where to write the picture.
+        result: The check.
+        title: Heading.
+    """
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    axes = figure.subplots()
+    bins = sorted({int(b) for b in (*result.histogram, *result.reference_histogram)})
+    reference = [result.reference_histogram.get(str(b), 0.0) for b in bins]
+    shown = [result.histogram.get(str(b), 0.0) for b in bins]
+    place = np.array(bins) + BIN_WIDTH / 2
+    axes.bar(
+        place - 1, reference, 2, color="0.6", label=f"{result.n_demonstrations} demonstrations in the band"
+    )
+    axes.bar(place + 1, shown, 2, color="tab:blue", label=f"{result.n_episodes} rollouts")
+    axes.axvspan(result.band[0], result.band[1] + 1, color="tab:green", alpha=0.12, linewidth=0, zorder=0)
+    axes.set(xlabel="length in frames", ylabel="share of episodes")
+    axes.set_xticks([*bins, bins[-1] + BIN_WIDTH], [*map(str, bins), str(bins[-1] + BIN_WIDTH)], rotation=90)
+    axes.legend()
+    axes.set_title(title, fontsize=10)
+    save_figure(figure, path)
+
+
+@Check.register_subclass("length")
+@dataclass
+class LengthCheck(Check):
+    """Compare the rollouts' lengths with those of the demonstrations in a band."""
+
+    # [shortest, longest] in frames of the demonstrations; null takes the band of those whose styles may be
+    # drawn (for a policy without styles, of all).
+    band: list[int] | None = None
+
+    file = "length_control"
+    heeds = ROLLOUTS
+    needs_rule = False
+
+    def __post_init__(self) -> None:
+        """Check the band."""
+        if self.band is not None and (len(self.band) != 2 or self.band[0] > self.band[1]):
+            raise ValueError(f"check.band={self.band}: expected [shortest, longest], e.g. [70,80]")
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """Roll out and compare lengths."""
+        checkpoint, env, options = subject.actor, subject.env, subject.rollouts
+        assert checkpoint is not None
+        assert env is not None
+        band = self.band_of(checkpoint, subject.trajectories)
+        starts = recorded_starts(env, subject.trajectories, options)
+        rollouts = run_rollouts(
+            checkpoint, env, lambda _: "", options.n_episodes, options.batch_size, options.seed, starts=starts
+        )
+        result = evaluate_length_control(
+            [rollout.length for rollout in rollouts],
+            subject.trajectories.lengths.tolist(),
+            band,
+            frames_after_end(subject.trajectories, env),
+        )
+        heading = f"{subject.title}: L1 {result.l1:.3f}"
+        return Finding(
+            result,
+            format_length_control(result),
+            lambda path: plot_length_control(path, result, heading),
+        )
+
+    def band_of(self, checkpoint: Checkpoint, trajectories: Trajectories) -> tuple[int, int]:
+        """The band that is asked for, or that of the demonstrations whose styles may be drawn."""
+        if self.band is not None:
+            return self.band[0], self.band[1]
+        drawn = allowed_episodes(checkpoint, len(trajectories))
+        lengths = trajectories.lengths if drawn is None else trajectories.lengths[drawn]
+        return int(lengths.min()), int(lengths.max())

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,7 +13,9 @@ from torch import Tensor
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import BOOTSTRAP_DRAWS, Interval
+from lerobot_swr.evaluation.plots import plot_offline
 from lerobot_swr.policies.demonstration_frames import dataset_frames
 from lerobot_swr.policies.style_policy import StylePolicy
 from lerobot_swr.similarity import similarity_by
@@ -267,3 +270,30 @@ def format_offline(result: OfflineResult) -> str:
             cells = ("       -" if means[kind] is None else f"{means[kind]:8.5f}" for kind in kinds)
             lines.append("  " + "  ".join([f"{name or '(none)':<24}", *cells]))
     return "\n".join(lines)
+
+
+@Check.register_subclass("offline")
+@dataclass
+class OfflineCheck(Check):
+    """Measure action errors on the dataset's frames, without an environment."""
+
+    file = "offline"
+    heeds = frozenset({"dataset.episodes", "behavior_rule"})
+    actor = "policy"
+    needs_env = False
+    needs_rule = False
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """See `frame_errors`."""
+        assert subject.actor is not None
+        behaviors = known_behaviors(subject.actor, subject.trajectories, subject.rule)
+        errors = frame_errors(
+            subject.actor, subject.trajectories, subject.dataset.episodes, subject.rollouts.seed, behaviors
+        )
+        result = summarize(errors)
+        per_frame = {kind: squared.mean(axis=1) for kind, squared in errors.squared.items()}
+        return Finding(
+            result,
+            format_offline(result),
+            lambda path: plot_offline(path, per_frame, errors.phase, KINDS.__getitem__, subject.title),
+        )

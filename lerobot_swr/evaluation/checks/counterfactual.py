@@ -1,16 +1,20 @@
 """Counterfactual check: from the same start, does each style lead to its demonstration's behaviour?"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from lerobot.envs import EnvConfig
 from lerobot.utils.constants import OBS_STATE
+from matplotlib.figure import Figure
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import Interval, histogram, style_fidelity, success_interval
+from lerobot_swr.evaluation.plots import save_figure
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.styles.request import StyleRequest
 from lerobot_swr.trajectories import Trajectories
@@ -203,3 +207,61 @@ def format_counterfactual(result: CounterfactualResult) -> str:
         lines.append(f"styles that led elsewhere: {', '.join(named)}; leave them out with")
         lines.append(f'--policy.style_filter="episode not in {sorted(strays)}"')
     return "\n".join(lines)
+
+
+def plot_counterfactual(path: Path, result: CounterfactualResult, title: str) -> None:
+    """The confusion matrix, requested × shown, as shares of each row.
+
+    Args:
+        path: Where to write the picture.
+        result: The check.
+        title: Heading.
+    """
+    labels = list(result.confusion)
+    strangers = sorted({shown for row in result.confusion.values() for shown in row} - set(labels))
+    columns = labels + strangers
+    counts = np.array([[row.get(shown, 0) for shown in columns] for row in result.confusion.values()])
+    shares = counts / counts.sum(axis=1, keepdims=True)
+    figure = Figure(figsize=(2.4 + 0.48 * len(columns), 1.9 + 0.4 * len(labels)), layout="constrained")
+    axes = figure.subplots()
+    axes.imshow(shares, cmap="Blues", vmin=0, vmax=1, aspect="auto")
+    for i, j in np.argwhere(counts):
+        color = "white" if shares[i, j] > 0.5 else "black"
+        axes.text(j, i, str(counts[i, j]), ha="center", va="center", color=color, fontsize=9)
+    axes.set_xticks(range(len(columns)), [label or "(none)" for label in columns], rotation=90)
+    axes.set_yticks(range(len(labels)), labels)
+    axes.set(xlabel="shown behaviour", ylabel="requested behaviour")
+    axes.set_title(title, fontsize=10)
+    save_figure(figure, path)
+
+
+@Check.register_subclass("counterfactual")
+@dataclass
+class CounterfactualCheck(Check):
+    """Request every demonstrated behaviour from the same starts."""
+
+    # Starts, the same for all behaviours: so many rollouts per behaviour.
+    starts: int = 40
+
+    file = "counterfactual"
+    heeds = frozenset({"batch_size", "behavior_rule"})
+
+    def __post_init__(self) -> None:
+        """Check the number of starts."""
+        if self.starts < 1:
+            raise ValueError(f"check.starts={self.starts}: expected at least 1")
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """See `run_counterfactual`."""
+        checkpoint, env, rule = subject.actor, subject.env, subject.rule
+        assert checkpoint is not None
+        assert env is not None
+        assert rule is not None
+        size, seed = subject.rollouts.batch_size, subject.rollouts.seed
+        result, _ = run_counterfactual(checkpoint, subject.trajectories, env, rule, self.starts, size, seed)
+        heading = f"{subject.title}: control accuracy {result.control_accuracy:.3f}"
+        return Finding(
+            result,
+            format_counterfactual(result),
+            lambda path: plot_counterfactual(path, result, heading),
+        )

@@ -1,15 +1,22 @@
 """Blends of styles: what a policy does between two demonstrations' styles, and how often it succeeds."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lerobot.envs import EnvConfig
+from matplotlib import colormaps
+from matplotlib.cm import ScalarMappable
+from matplotlib.figure import Figure
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
+from lerobot_swr.evaluation.plots import save_figure
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
 from lerobot_swr.styles.request import StyleRequest
 
@@ -131,3 +138,97 @@ def format_blends(result: BlendResult) -> str:
             name = f"{n} pairs, {kind}: {what}"
             lines.append(f"{name:<42}" + "".join(f"{value:7.3f}" for value in rates[kind]))
     return "\n".join(lines)
+
+
+def plot_blends(
+    path: Path,
+    result: BlendResult,
+    paths: Sequence[np.ndarray],
+    env_cfg: EnvConfig,
+    title: str,
+    examples: int = 2,
+) -> None:
+    """Blends of the first pairs of each kind in the scene, and how often blends succeed.
+
+    Args:
+        path: Where to write the picture.
+        result: The check.
+        paths: Path (T, 2) of every rollout.
+        env_cfg: Its task draws the scene.
+        title: Heading.
+        examples: Pairs of each kind to draw.
+    """
+    kinds = list(result.n_pairs)
+    figure = Figure(figsize=(4.2 * len(kinds) + 4.6, 8.4), layout="constrained")
+    grid = figure.subplots(examples, len(kinds) + 1, squeeze=False)
+    colors = colormaps["viridis"]
+    for column, kind in enumerate(kinds):
+        mine = [k for k, record in enumerate(result.episodes) if record["pair"] == kind]
+        for row in range(examples):
+            axes = grid[row, column]
+            axes.set(xticks=[], yticks=[], aspect="equal")
+            chosen = mine[row * len(result.shares) : (row + 1) * len(result.shares)]
+            if not chosen:
+                axes.set_axis_off()
+                continue
+            task_of(env_cfg).draw_scene(axes)
+            for k in chosen:
+                record = result.episodes[k]
+                style = "-" if record["success"] else ":"
+                axes.plot(*paths[k].T, style, color=colors(record["share"]), linewidth=1.8)
+            i, j = result.episodes[chosen[0]]["episodes"]
+            ends = result.episodes[chosen[0]]["ends"]
+            axes.set_title(f"{kind}: {i} ({ends[0]}) to {j} ({ends[1]})", fontsize=10)
+    for row, (name, rates) in enumerate(
+        (("success rate", result.success_rate), ("shows the behaviour of an end", result.end_behavior_rate))
+    ):
+        axes = grid[row, -1]
+        for kind in kinds:
+            axes.plot(result.shares, rates[kind], "o-", label=f"{result.n_pairs[kind]} pairs, {kind}")
+        axes.set(xlabel="share of the second style", ylabel=name, ylim=(-0.03, 1.03))
+        axes.legend(loc="lower left")
+    for row in range(2, examples):
+        grid[row, -1].set_axis_off()
+    scale = ScalarMappable(cmap=colors)
+    scale.set_clim(0, 1)
+    figure.colorbar(
+        scale, ax=grid[:, :-1], shrink=0.5, label="share of the second style (dotted: no success)"
+    )
+    figure.suptitle(title)
+    save_figure(figure, path)
+
+
+@Check.register_subclass("blend")
+@dataclass
+class BlendCheck(Check):
+    """Roll out blends of two styles, with the same behaviour and with different ones."""
+
+    # Pairs of styles of each kind.
+    pairs: int = 40
+
+    file = "blend"
+    heeds = frozenset({"batch_size", "behavior_rule"})
+    actor = "policy"
+
+    def __post_init__(self) -> None:
+        """Check the number of pairs."""
+        if self.pairs < 1:
+            raise ValueError(f"check.pairs={self.pairs}: expected at least 1")
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """See `run_blends`."""
+        checkpoint, env, rule = subject.actor, subject.env, subject.rule
+        assert checkpoint is not None
+        assert env is not None
+        assert rule is not None
+        demonstrated = [rule(episode) for episode in subject.trajectories.episodes()]
+        size, seed = subject.rollouts.batch_size, subject.rollouts.seed
+        result, rollouts = run_blends(checkpoint, env, rule, demonstrated, self.pairs, size, seed)
+        task = task_of(env)
+        paths = [task.plot_path(rollout.observations) for rollout in rollouts]
+        heading = f"{subject.title}: blends of two styles"
+        return Finding(
+            result,
+            format_blends(result),
+            lambda path: plot_blends(path, result, paths, env, heading),
+        )

@@ -1,6 +1,6 @@
 """Replay: recorded actions played open loop from the recorded start. Do the data and the simulator agree?"""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +13,10 @@ from lerobot.utils.constants import ACTION
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import check_environment, load_demonstrations, simulated_names
+from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import Interval, success_interval
 from lerobot_swr.evaluation.open_loop import Replay, play
+from lerobot_swr.evaluation.replay_plots import plot_replay
 from lerobot_swr.evaluation.time_offsets import (
     OFFSETS,
     ColumnGroup,
@@ -210,3 +212,34 @@ def summarize(result: ReplayResult) -> str:
 def _shorten(group: ColumnGroup, width: int = 44) -> str:
     text = f"{group.feature}: {', '.join(group.columns)}"
     return text if len(text) <= width else f"{text[: width - 1]}…"
+
+
+@Check.register_subclass("replay")
+@dataclass
+class ReplayCheck(Check):
+    """Play every episode's recorded actions from its recorded start: do data and environment agree?"""
+
+    file = "replay"
+    heeds = frozenset({"batch_size", "behavior_rule", "dataset.episodes"})
+    actor = "none"
+    needs_rule = False
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """See `run_replay`."""
+        assert subject.env is not None
+        task, options = task_of(subject.env), subject.rollouts
+        result, recorded, observed = run_replay(
+            subject.dataset.metadata(),
+            subject.env,
+            subject.rule,
+            subject.dataset.episodes,
+            options.batch_size,
+            options.seed,
+        )
+        succeeded = [row["success"] for row in result.episodes]
+        heading = f"replay of {subject.title}: {result.finding}"
+        return Finding(
+            result,
+            format_replay(result),
+            lambda path: plot_replay(path, succeeded, result.offsets, recorded, observed, task, heading),
+        )

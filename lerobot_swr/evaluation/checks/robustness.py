@@ -8,15 +8,11 @@ from lerobot.envs import EnvConfig
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.task import task_of
-from lerobot_swr.evaluation.behavior_evaluation import (
-    BehaviorResult,
-    allowed_episodes,
-    evaluate_behaviors,
-    steps_to_end,
-)
+from lerobot_swr.evaluation.behavior_evaluation import BehaviorResult, evaluate_behaviors, steps_to_end
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.evaluation.checks.check import ROLLOUTS, Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import Interval
-from lerobot_swr.evaluation.rollouts import run_rollouts
+from lerobot_swr.evaluation.rollouts import allowed_episodes, run_rollouts
 from lerobot_swr.trajectories import Trajectories
 
 
@@ -84,7 +80,7 @@ def perturbed(env_cfg: EnvConfig) -> dict[str, dict[str, Any]]:
     if not options:
         raise ValueError(
             f"env.type={env_cfg.type!r} names no perturbations; perturb it by its own flags and evaluate "
-            "without --robustness"
+            "without --check.type=robustness"
         )
     return {"as it is": {}, **options}
 
@@ -123,7 +119,7 @@ def run_robustness(
     demonstrated = [rule(episode) for episode in trajectories.episodes()]
     lengths = steps_to_end(env_cfg, trajectories)
     sampling = checkpoint.policy.config.style_sampling if checkpoint.has_styles else None
-    drawn = allowed_episodes(checkpoint, len(demonstrated)) if checkpoint.has_styles else None
+    drawn = allowed_episodes(checkpoint, len(demonstrated))
     cells: list[RobustnessCell] = []
     for name, options in perturbed(env_cfg).items():
         if only is not None and name not in only:
@@ -159,3 +155,32 @@ def _with_interval(value: float | None, interval: Interval | None, digits: int) 
     if value is None or interval is None:
         return "-"
     return f"{value:.{digits}f} {interval:.{digits}f}"
+
+
+@Check.register_subclass("robustness")
+@dataclass
+class RobustnessCheck(Check):
+    """Roll out under every perturbation of the environment, with each style equally often."""
+
+    file = "robustness"
+    heeds = ROLLOUTS - {"recorded_starts"} | {"behavior_rule", "dataset.episodes"}
+    style_sampling = "stratified"
+
+    def run(self, subject: Subject, keep: Callable[[Any], None]) -> Finding:
+        """See `run_robustness`; the results are kept after each perturbation."""
+        assert subject.actor is not None
+        assert subject.env is not None
+        assert subject.rule is not None
+        options = subject.rollouts
+        result = run_robustness(
+            subject.actor,
+            subject.trajectories,
+            subject.env,
+            subject.rule,
+            options.n_episodes,
+            options.batch_size,
+            options.seed,
+            reference_episodes=subject.dataset.episodes,
+            after_each=keep,
+        )
+        return Finding(result, format_robustness(result))
