@@ -15,7 +15,7 @@ from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 from lerobot.utils.utils import init_logging
 
-from lerobot_swr.behaviors import load_behavior_rule
+from lerobot_swr.behavior_rules import load_behavior_rule
 from lerobot_swr.cli.errors import explain_errors
 from lerobot_swr.cli.eval_options import checkpoint_config
 from lerobot_swr.cli.literal_flags import with_literal_text

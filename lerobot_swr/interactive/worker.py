@@ -15,7 +15,7 @@ from typing import Any
 from lerobot.configs import PreTrainedConfig
 from lerobot.envs import EnvConfig
 
-from lerobot_swr.behaviors import load_behavior_rule
+from lerobot_swr.behavior_rules import load_behavior_rule
 from lerobot_swr.demos.writer import check_folder
 from lerobot_swr.errors import USER_ERRORS, one_line
 from lerobot_swr.evaluation.checkpoint import (
