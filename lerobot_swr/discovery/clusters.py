@@ -110,7 +110,7 @@ def split(points: np.ndarray, number: int) -> np.ndarray:
     if number == 1 or len(points) < 2:
         return np.zeros(len(points), dtype=int)
     rng = np.random.default_rng(0)
-    some = np.arange(len(points))
+    some: np.ndarray = np.arange(len(points))
     if len(points) > CLUSTERED:
         some = np.sort(rng.choice(len(points), CLUSTERED, replace=False))
     groups = fcluster(linkage(points[some], "ward"), number, "maxclust") - 1

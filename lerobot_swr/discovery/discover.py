@@ -192,7 +192,7 @@ def _best_view(paths: Paths, kept: np.ndarray, number: int | None, rng: np.rando
 def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, least: int) -> Discovery:
     """Number the behaviours by their size, find typical episodes and give the reasons of the outliers."""
     count = len(kept)
-    groups = np.full(count, -1)
+    groups: np.ndarray = np.full(count, -1)
     groups[view.members] = view.groups
     numbers, sizes = np.unique(groups[groups >= 0], return_counts=True)
     if not (sizes >= least).any():
