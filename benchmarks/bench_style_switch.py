@@ -6,32 +6,52 @@ python -m benchmarks.bench_style_switch --policy.path=CHECKPOINT --env.type=maze
 
 import json
 from collections import Counter
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from lerobot.configs import parser
+from lerobot.configs import PreTrainedConfig, parser
+from lerobot.envs import EnvConfig
 from lerobot.utils.import_utils import register_third_party_plugins
 
-from lerobot_swr.cli.eval_options import EvalCommand
-from lerobot_swr.evaluation.checkpoint import load_checkpoint, load_reference
+from lerobot_swr.cli.eval_options import checkpoint_config
+from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_reference
 from lerobot_swr.evaluation.metrics import success_interval
 from lerobot_swr.interactive.session import Session
 from lerobot_swr.interactive.switching import measure_switches, share_kept
 
 
 @dataclass
-class SwitchCommand(EvalCommand):
+class SwitchCommand:
     """Options."""
 
+    env: EnvConfig | None = None
+    policy: PreTrainedConfig | None = None
+    # The policy's training dataset.
+    dataset: DatasetSource = field(default_factory=DatasetSource)
     # Rollouts of as many other behaviours are switched to each behaviour.
     n_first: int = 3
+    # Of the styles and the environment.
+    seed: int = 0
+    # Where style_switch.json goes.
+    output_dir: Path = Path("outputs/style_switch")
+
+    def __post_init__(self) -> None:
+        """Find the checkpoint."""
+        path = parser.get_path_arg("policy")
+        if self.env is None or not path:
+            raise ValueError("give --env.type=... and --policy.path=CHECKPOINT")
+        self.policy = checkpoint_config(path)
+
+    @classmethod
+    def __get_path_fields__(cls) -> list[str]:
+        """Keys that LeRobot's parser loads from a folder."""
+        return ["policy"]
 
 
 @parser.wrap()
 def measure(cfg: SwitchCommand) -> None:
     assert cfg.env is not None
     assert cfg.policy is not None
-    assert cfg.output_dir is not None
     checkpoint = load_checkpoint(cfg.policy)
     session = Session(cfg.env, checkpoint, cfg.seed)
     assert session.rule is not None
@@ -51,7 +71,7 @@ def measure(cfg: SwitchCommand) -> None:
         print(f"{moment}: {good}/{total} = {good / total:.3f} [{low:.3f}, {high:.3f}]")
     print(f"steps to the first action of the new style: {dict(Counter(s.latency for s in switches))}")
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
-    path = Path(cfg.output_dir) / "style_switch.json"
+    path = cfg.output_dir / "style_switch.json"
     path.write_text(json.dumps([asdict(switch) for switch in switches], indent=1))
     print(f"written to {path}")
 
