@@ -12,6 +12,7 @@ import numpy as np
 
 SMALLEST_SHARE = 0.05  # of a dimension's standard deviation: what differs less at the start says no scene
 LARGE_SHARE = 0.3  # from which on scenes are said to vary
+MOST_FRAMES = 200_000  # that give the standard deviations of all
 NOISE = 2.0  # how many times its change to the next frame a difference between starts must be
 
 logger = logging.getLogger(__name__)
@@ -61,7 +62,8 @@ def scene_variation(
     starts = np.cumsum(lengths) - lengths
     first = frames[starts].astype(np.float64)
     second = frames[starts + np.minimum(1, lengths - 1)].astype(np.float64)
-    spread, overall = first.std(axis=0), frames.std(axis=0, dtype=np.float64)
+    some = frames[:: -(-len(frames) // MOST_FRAMES)]  # no second copy of very many
+    spread, overall = first.std(axis=0), some.std(axis=0, dtype=np.float64)
     change = np.sqrt(np.square(second - first).mean(axis=0))
     shares = np.divide(spread, overall, out=np.zeros_like(spread), where=overall > 0)
     rounding = 1e-6 * np.abs(first).max(axis=0, initial=0)

@@ -216,9 +216,11 @@ class TrainingData:
     @cached_property
     def scene_variation(self) -> SceneVariation:
         """How much scenes differ from episode to episode."""
-        keys = self.config.observation_keys
-        names = [name for group in dimension_names(self.meta, keys).values() for name in group]
-        return scene_variation(self.trajectories.joined(keys), self.trajectories.lengths, names)
+        names = dimension_names(self.meta, self.config.observation_keys)
+        lengths, columns = self.trajectories.lengths, self.trajectories.columns
+        parts = [scene_variation(columns[key], lengths, own) for key, own in names.items()]
+        shares = np.concatenate([part.shares for part in parts])
+        return SceneVariation(shares, tuple(name for part in parts for name in part.names))
 
     @property
     def first_observations(self) -> torch.Tensor:
