@@ -20,7 +20,7 @@ from lerobot_swr.discovery.features import (
     main_directions,
     measure_paths,
 )
-from lerobot_swr.discovery.outliers import Manner, describe_manner, nearest_distance, reason, suspicious
+from lerobot_swr.discovery.outliers import Manner, describe_manner, nearest_distance, reasons, suspicious
 from lerobot_swr.trajectories import Trajectories
 
 OUTLIER = "outlier"
@@ -206,12 +206,9 @@ def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, l
     few = {i: small[int(groups[i])] for i in range(count) if int(groups[i]) in small}
     groups = np.array([order.get(int(group), -1) for group in groups])
     fits = groups >= 0
-    reasons = {
-        i: f"alone on its way ({few[i]} of a kind): {reason(i, paths.paths, view.residuals, manner, fits)}"
-        if i in few
-        else reason(i, paths.paths, view.residuals, manner, fits)
-        for i in np.flatnonzero(~fits).tolist()
-    }
+    outliers = np.flatnonzero(~fits).tolist()
+    told = reasons(outliers, paths.paths, view.residuals, manner, fits)
+    told |= {i: f"alone on its way ({few[i]} of a kind): {told[i]}" for i in outliers if i in few}
     places = view.residuals @ view.features.directions.T
     medoids, reach = [], []
     usual = float(np.median(nearest_distance(view.residuals, fits)[fits]))
@@ -226,7 +223,7 @@ def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, l
         groups,
         tuple(f"behavior {k + 1}" for k in range(len(behaviours))),
         tuple(medoids),
-        reasons,
+        told,
         places,
         np.array(reach),
         view.separation if len(behaviours) > 1 else 0.0,

@@ -110,44 +110,46 @@ def _far_away(places: np.ndarray, kept: np.ndarray) -> np.ndarray:
     return far_beyond(distance, kept, FARTHER) & (distance > LEAST_APART)
 
 
-def reason(
-    episode: int, paths: np.ndarray, residuals: np.ndarray, manner: Manner | None, kept: np.ndarray
-) -> str:
-    """Why an episode fits nowhere.
+def reasons(
+    episodes: Sequence[int],
+    paths: np.ndarray,
+    residuals: np.ndarray,
+    manner: Manner | None,
+    kept: np.ndarray,
+) -> dict[int, str]:
+    """Why episodes fit nowhere.
 
     Args:
-        episode: Its number.
+        episodes: Their numbers.
         paths: (N, P, m).
         residuals: (N, P·m).
         manner: See `suspicious`.
         kept: (N,) bool, the episodes that fit somewhere.
     """
-    others = np.flatnonzero(kept)
-    distance = np.linalg.norm(residuals[others] - residuals[episode], axis=1)
-    usual = float(np.median(nearest_distance(residuals, kept)[kept]))
-    times = (
-        f"{distance.min() / usual:.1f} times as far from the nearest episode as usual" if usual else "alone"
-    )
-    if manner is None:
-        return f"far from all others: {times}"
-    frames, way = manner.frames[episode], manner.way[episode] / np.median(manner.way[kept])
-    if way < STILL:
-        return f"frozen: covers {way:.0%} of the usual way"
-    if frames < SHORT * np.median(manner.frames[kept]):
-        return f"too short: {int(frames)} frames, {np.median(manner.frames[kept]):.0f} are usual"
-    roughness = manner.roughness[episode] / max(np.median(manner.roughness[kept]), 1e-12)
-    if far_beyond(manner.roughness, kept)[episode] and roughness > ROUGH:
-        return f"noise: steps change {roughness:.1f} times as much as usual from frame to frame"
-    spoiled = _spoiled_how(episode, paths, others)
-    if spoiled is not None:
-        return spoiled
-    far_ends = [
-        name
-        for name, places in (("start", manner.firsts), ("end", manner.lasts))
-        if _far_away(places, kept)[episode]
-    ]
-    where = f"; its {' and '.join(far_ends)} lies where no other's does" if far_ends else ""
-    return f"path far from any: {times}{where}"
+    if not len(episodes):
+        return {}
+    others, distance = np.flatnonzero(kept), nearest_distance(residuals, kept)
+    usual = float(np.median(distance[kept]))
+    times = {i: f"{distance[i] / usual:.1f} times as far from the nearest episode as usual" for i in episodes}
+    if manner is None or not usual:
+        return {i: f"far from all others: {times[i]}" if usual else "alone" for i in episodes}
+    way, frames = manner.way / np.median(manner.way[kept]), np.median(manner.frames[kept])
+    roughness = manner.roughness / max(float(np.median(manner.roughness[kept])), 1e-12)
+    rough = far_beyond(manner.roughness, kept) & (roughness > ROUGH)
+    far_ends = {"start": _far_away(manner.firsts, kept), "end": _far_away(manner.lasts, kept)}
+    told = {}
+    for i in episodes:
+        if way[i] < STILL:
+            told[i] = f"frozen: covers {way[i]:.0%} of the usual way"
+        elif manner.frames[i] < SHORT * frames:
+            told[i] = f"too short: {int(manner.frames[i])} frames, {frames:.0f} are usual"
+        elif rough[i]:
+            told[i] = f"noise: steps change {roughness[i]:.1f} times as much as usual from frame to frame"
+        else:
+            ends = [name for name, far in far_ends.items() if far[i]]
+            where = f"; its {' and '.join(ends)} lies where no other's does" if ends else ""
+            told[i] = _spoiled_how(i, paths, others) or f"path far from any: {times[i]}{where}"
+    return told
 
 
 def _spoiled(paths: np.ndarray, kept: np.ndarray) -> np.ndarray:
