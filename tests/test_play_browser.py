@@ -129,7 +129,7 @@ def paused_early(person) -> bool:
     person.until(lambda: person.ask("!frame.paused && frame.phase === 'running' && frame.steps >= 2"))
     person.press("pause")
     person.until(lambda: person.ask("frame.paused"))
-    return person.ask("frame.steps") <= 10
+    return person.ask("frame.phase === 'running' && frame.steps >= 2 && frame.steps <= 10")
 
 
 def test_clicked_styles_are_followed_in_mid_rollout(small_maze, trained, monkeypatch):
