@@ -162,4 +162,3 @@ def test_clicked_styles_are_followed_in_mid_rollout(small_maze, trained, monkeyp
 
         person.browser.set_window_size(390, 844)
         person.until(lambda: person.ask("document.documentElement.scrollWidth <= innerWidth"), 10)
-        assert not [entry for entry in person.browser.get_log("browser") if entry["level"] == "SEVERE"]
