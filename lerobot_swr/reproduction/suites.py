@@ -88,8 +88,9 @@ LENGTH_BAND = (70, 80)
 SCENES_POLICIES = ("bc", "act", "diffusion", "beso", "zbc", "wzbc")
 # As published, and so that other demonstrations teach a style, too, in their scenes.
 SCENES_WZBC: tuple[dict[str, Any], ...] = ({}, {"beta": 2.0})
-# ZBC with styles made of a similarity of manner, by type and task of the environment: what tells how it is
-# done, wherever things lie.
+# ZBC, and WZBC with corrective labels, with styles made of a similarity of manner; by type and task of the
+# environment: what tells how it is done, wherever things lie.
+SCENES_CORRECTIVE: dict[str, Any] = {"corrective": "noise", "corrective_scale": 0.05}
 MANNERS: dict[tuple[str, str], dict[str, Any]] = {
     ("maze2d", "scenes"): {"similarity_features": "lerobot_swr.envs.maze2d.manner:scenes", "style_dim": 1},
     ("maze2d", "scenes_large"): {
@@ -218,10 +219,11 @@ def _scenes(settings: ReproductionSettings, demos: Demonstrations) -> Iterable[C
         raise ValueError(f"datasets: {demos.name!r}: every episode of its environment has the same scene")
     known = [policy for policy in SCENES_POLICIES if policy in known_policies()]
     manner = MANNERS.get((demos.env["type"], demos.env["task"]))
-    embedded = () if manner is None else ({"style_init": "similarity", **manner},)
-    variants = {"wzbc": SCENES_WZBC, "zbc": ({}, *embedded)}
+    embedded: list[dict[str, Any]] = [] if manner is None else [{"style_init": "similarity", **manner}]
+    corrected = [{**options, **SCENES_CORRECTIVE} for options in embedded]
+    variants = {"wzbc": [*SCENES_WZBC, *corrected], "zbc": [{}, *embedded]}
     for policy in settings.choose_policies(tuple(known)):
-        for options in variants.get(policy, ({},)):
+        for options in variants.get(policy, [{}]):
             trained = training(settings, demos, policy, options)
             for kind, condition in SCENE_CONDITIONS.items():
                 protocols = ("stratified", "scene") if kind == "new" else ("stratified",)
