@@ -129,9 +129,10 @@ def paused_early(person) -> bool:
     person.until(lambda: person.ask("!frame.paused && frame.phase === 'running' && frame.steps >= 2"))
     person.press("pause")
     person.until(lambda: person.ask("frame.paused"))
-    return person.ask("frame.phase === 'running' && frame.steps >= 2 && frame.steps <= 10")
+    return person.ask("frame.phase === 'running' && frame.steps >= 2 && frame.steps <= 5")
 
 
+@pytest.mark.slow  # whether the policy follows depends on what it has learned
 def test_clicked_styles_are_followed_in_mid_rollout(small_maze, trained, monkeypatch):
     """One behaviour after the other, clicked in mid-rollout; a bad filter is told; a phone's window fits."""
     policy = PreTrainedConfig.from_pretrained(trained)
