@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import Any
 
 PROGRESS = re.compile(r"Training:.*?\| *(\d+)/(\d+)")  # of tqdm
-TRAIN = "from lerobot_swr.cli.train import main; main()"  # wherever its script is installed
+# The command's main function, wherever its script is installed; its progress every second, as a page wants it.
+TRAIN = """
+from lerobot_swr import progress
+progress.LOG_INTERVAL = 1.0
+from lerobot_swr.cli.train import main
+main()
+"""
 LAST_WORDS = 12  # lines of the command that are told if it fails
 
 
