@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 PROGRESS = re.compile(r"Training:.*?\| *(\d+)/(\d+)")  # of tqdm
-# The command's main function, wherever its script is installed; its progress every second, as a page wants it.
+# The command, wherever its script is installed; its progress every second, as a page wants it.
 TRAIN = """
 from lerobot_swr import progress
 progress.LOG_INTERVAL = 1.0
