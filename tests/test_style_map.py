@@ -8,8 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-import torch
-from conftest import make_batch, save_checkpoint
+from conftest import save_checkpoint
 
 from lerobot_swr.cli import styles as styles_command
 from lerobot_swr.html_pages import as_script, principal_components
@@ -44,10 +43,7 @@ def test_paths_are_thinned_and_keep_their_ends(small_maze_meta):
 @pytest.fixture
 def page(make_tiny_policy, small_maze, small_maze_meta, tmp_path, run_command):
     """The map of a tiny policy, made by the command."""
-    policy = make_tiny_policy("zbc")
-    policy.train()
-    policy.forward({**make_batch(), "episode_index": torch.arange(32) % 5})
-    folder = save_checkpoint(policy.eval(), small_maze_meta, tmp_path / "checkpoint")
+    folder = save_checkpoint(make_tiny_policy("zbc").eval(), small_maze_meta, tmp_path / "checkpoint")
     page = tmp_path / "styles.html"
     run_command(styles_command.main, folder, f"--map={page}", f"--dataset.root={small_maze}")
     return page
@@ -109,7 +105,7 @@ def test_a_browser_draws_the_map_and_gives_the_flag(page):
     dom = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     result = dom.split("<pre>RESULT|")[1].split("</pre>")[0]
     points, flag, shown, info = result.split("|")
-    assert points == "5"
+    assert points == "6"
     assert flag == "--policy.style_episodes=[1,4]"
     assert shown == "2"
     assert info.startswith("episode 2 · length ")
