@@ -302,7 +302,7 @@ function drawMap() {
     ? [trace(all, column, {color: values, colorscale: "Viridis", showscale: true})]
     : [...new Set(values)].sort().map(name =>
       trace(all.filter(r => values[r] === name), escaped(name), {color: colourOf(name)}));
-  Plotly.react("map", traces, {margin: {l: 30, r: 8, t: 8, b: 28}, dragmode: "lasso", hovermode: "closest",
+  Plotly.react("map", traces, {margin: {l: 30, r: 8, t: 32, b: 28}, dragmode: "lasso", hovermode: "closest",
     showlegend: !isNumber && innerWidth > 600, xaxis: {zeroline: false}, yaxis: {zeroline: false}},
     {responsive: true, displaylogo: false, scrollZoom: false,
       modeBarButtonsToRemove: ["toImage", "zoomIn2d", "zoomOut2d", "autoScale2d"]});
