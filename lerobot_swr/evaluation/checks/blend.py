@@ -13,6 +13,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
@@ -210,6 +211,7 @@ class BlendCheck(Check):
     heeds = frozenset({"batch_size", "behavior_rule"})
     actor = "policy"
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the number of pairs."""
         if self.pairs < 1:

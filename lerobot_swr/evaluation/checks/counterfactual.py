@@ -11,6 +11,7 @@ from lerobot.utils.constants import OBS_STATE
 from matplotlib.figure import Figure
 
 from lerobot_swr.behaviors import BehaviorRule
+from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.checks.check import Check, Finding, Subject
 from lerobot_swr.evaluation.metrics import Interval, histogram, style_fidelity, success_interval
@@ -246,6 +247,7 @@ class CounterfactualCheck(Check):
     file = "counterfactual"
     heeds = frozenset({"batch_size", "behavior_rule"})
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the number of starts."""
         if self.starts < 1:

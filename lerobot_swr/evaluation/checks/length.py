@@ -9,6 +9,7 @@ import numpy as np
 from lerobot.envs import EnvConfig
 from matplotlib.figure import Figure
 
+from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.checks.check import ROLLOUTS, Check, Finding, Subject
@@ -156,6 +157,7 @@ class LengthCheck(Check):
     heeds = ROLLOUTS
     needs_rule = False
 
+    @tells_bad_values
     def __post_init__(self) -> None:
         """Check the band."""
         if self.band is not None and (len(self.band) != 2 or self.band[0] > self.band[1]):
