@@ -233,7 +233,7 @@ class TrainingData:
         dimensions = self.config.dimensions
         rows = len(next(iter(features.values())))
         blank = {key: torch.zeros(rows, d) for key, d in dimensions.items()}
-        found = vector_pipelines(self.config, self.meta.stats)[0]({**blank, **features})
+        found = vector_pipelines(self.config, dimensions, self.meta.stats)[0]({**blank, **features})
         return {key: found[key] for key in features}
 
     def frames(self, episode: int, rows: np.ndarray) -> Frames:
