@@ -20,7 +20,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from lerobot_swr.behavior_rules import dataset_behavior_rule
 from lerobot_swr.discovery.discover import discover
-from lerobot_swr.discovery.features import Source
+from lerobot_swr.discovery.sources import Source
 from lerobot_swr.evaluation.checkpoint import load_demonstrations
 from lerobot_swr.trajectories import Trajectories
 

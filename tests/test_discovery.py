@@ -9,8 +9,8 @@ from sklearn.metrics import adjusted_rand_score
 
 from lerobot_swr.discovery.clusters import split, support
 from lerobot_swr.discovery.discover import OUTLIER, Discovery, discover, named
-from lerobot_swr.discovery.features import Source
 from lerobot_swr.discovery.paths import walk
+from lerobot_swr.discovery.sources import Source
 from lerobot_swr.trajectories import Trajectories
 
 STATE = "observation.state"

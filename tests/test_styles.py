@@ -5,8 +5,8 @@ from collections import Counter
 import pytest
 import torch
 
-from lerobot_swr.styles.cookbook import BLENDED, StyleCookbook
-from lerobot_swr.styles.request import StyleRequest
+from lerobot_swr.styles.cookbook import StyleCookbook
+from lerobot_swr.styles.request import BLENDED, StyleRequest
 from lerobot_swr.styles.selection import StyleSelection
 
 

@@ -24,10 +24,10 @@ from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.dataset_checks import edit_command
 from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.discovery.discover import OUTLIER, Discovery, discover, named
-from lerobot_swr.discovery.features import Source
 from lerobot_swr.discovery.frames import strips
 from lerobot_swr.discovery.report import REPORT_FILE, write_report
 from lerobot_swr.discovery.rule import RULE_FILE, rule_data, write_rule
+from lerobot_swr.discovery.sources import Source
 from lerobot_swr.evaluation.checkpoint import DatasetSource
 from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
 from lerobot_swr.whole_files import write_whole

@@ -14,8 +14,8 @@ from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.observed import as_simulated
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
-from lerobot_swr.styles.cookbook import BLENDED
 from lerobot_swr.styles.drawing import check_style_sampling
+from lerobot_swr.styles.request import BLENDED
 from lerobot_swr.trajectories import Trajectories
 
 

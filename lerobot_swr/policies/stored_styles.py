@@ -99,8 +99,21 @@ class StoredStyles(CheckedLoading):
             ValueError: Without a checkpoint with styles of the same dataset to begin from.
         """
         super()._validate_peft_config(peft_config)  # type: ignore[misc]
-        if self.data is not None and self.data.is_new:
+        if self.data is not None and self.data.fine_tunes:
             raise ValueError(
                 f"peft: the adapters' checkpoint would keep the styles of {self.config.pretrained_path}, "
                 f"which are not those of dataset.root={str(self.data.root)!r}; fine-tune without adapters"
+            )
+
+    def _refuse_untrained_styles(self) -> None:
+        """Refuse to act with styles that a checkpoint of other data does not know.
+
+        Raises:
+            ValueError: Naming the dataset.
+        """
+        if self.data is not None and self.data.fine_tunes:
+            raise ValueError(
+                f"this policy was created to be trained on {self.data.root}, which is not the dataset of "
+                f"its checkpoint, so its {len(self.styles)} styles are new; to act with the checkpoint's, "
+                "load it without dataset_meta (ds_meta), whatever dataset you evaluate on"
             )

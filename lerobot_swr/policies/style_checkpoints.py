@@ -66,7 +66,7 @@ def with_own_styles(
     state = {**scenes, **state}
     if data is None:
         return state
-    if not data.is_new:
+    if not data.fine_tunes:
         # Episodes that this run trains on and those that the checkpoint was trained on.
         known = state.get("styles.trained")
         if known is not None and known.shape == styles.trained.shape:
@@ -90,7 +90,7 @@ def adopt_table(styles: StyleCookbook, stored: StyleTable | None, data: Training
     Raises:
         ValueError: If the table is not that of the checkpoint.
     """
-    if data is not None and data.is_new:
+    if data is not None and data.fine_tunes:
         if stored is not None and stored.filters:
             logger.warning(
                 "Named filters of the old dataset's styles are dropped: %s", ", ".join(stored.filters)

@@ -17,16 +17,9 @@ from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
 from lerobot_swr.policies.scene_defaults import adopt_scene_defaults
 from lerobot_swr.policies.stored_styles import StoredStyles
-from lerobot_swr.policies.training_data import (
-    TrainingData,
-    adopt_features,
-    adopt_names,
-    make_embedding,
-    make_sampler,
-    make_table,
-)
+from lerobot_swr.policies.style_making import make_cookbook, make_sampler
+from lerobot_swr.policies.training_data import TrainingData, adopt_features, adopt_names
 from lerobot_swr.styles.cookbook import StyleCookbook
-from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.styles.encoding import ActionErrors, Imitation
 from lerobot_swr.styles.held_out import HeldOutStyles
 from lerobot_swr.trajectories import Trajectories
@@ -66,14 +59,13 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
 
     def __init__(self, config: BCConfig, dataset_meta: LeRobotDatasetMetadata | None = None, **kwargs: Any):
         super().__init__(config)
-        self._has_learned = False
+        self._has_trained = False
         self.features_of = "environment" if dataset_meta is None else f"dataset {dataset_meta.root}"
         adopt_features(config, dataset_meta)
-        if dataset_meta is not None:
-            adopt_names(config, dataset_meta)
         self.data: TrainingData | None = None
         self.balance: Balance | None = None
         if dataset_meta is not None:
+            adopt_names(config, dataset_meta)
             self.data = data = TrainingData.read(config, dataset_meta)
             self.balance = Balance(data.trajectories, data.run.episodes, data.pauses, config.balance_episodes)
             if isinstance(config, ZBCConfig):
@@ -105,26 +97,15 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         assert config.style_dim is not None
         data, dynamics = self.data, None
         if data is not None:
-            config.num_added_styles = 0 if data.is_new else config.num_added_styles
+            config.num_added_styles = 0 if data.fine_tunes else config.num_added_styles
             dynamics = adopt_dynamics(config, data)
         if config.action_targets is not None and getattr(config.backbone, "looks_for_things", False):
             raise ValueError(
                 "backbone.encoder='objects' says by itself what actions are relative to: give "
                 "--policy.corrective_relative=false"
             )
-        self.styles = StyleCookbook(
-            config.num_episodes + config.num_added_styles,
-            config.style_dim,
-            config.style_init_scale,
-            check_style_sampling(config.style_sampling or "uniform"),
-            config.style_selection,
-            config.observation_dim,
-            config.near_scenes,
-        )
+        self.styles = make_cookbook(config, data)
         self.held_out = HeldOutStyles(self.styles, data)
-        if config.style_init == "similarity":
-            self.styles.embed(make_embedding(config, data), None if data is None else data.compared)
-        self.styles.embedding.requires_grad_(not config.has_fixed_styles)
         if config.style_noise:
             self.blur = Blur(config.style_noise, config.style_dim)
         self.relative = make_relative_actions(config)
@@ -134,10 +115,6 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             stream = dynamics.corrective_stream(config, self.balance.factors.numpy())
         if config.corrective != "none":
             self.correct = Correct(stream)
-        if data is not None:
-            self.styles.trained[list(data.run.episodes)] = 1
-            self.styles.scenes.fit(data.first_observations, data.scene_variation.shares > 0)
-            self.styles.table = make_table(config, data)
 
     @property
     def trajectories(self) -> Trajectories:
@@ -155,8 +132,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
     @property
     def steps(self) -> list[LessonStep]:
         """The steps that make a lesson of a batch, in order."""
-        steps: tuple[LessonStep | None, ...] = (self.balance, self.correct, self.relabel, self.blur)
-        return [step for step in steps if step is not None]
+        return [step for step in (self.balance, self.correct, self.relabel, self.blur) if step is not None]
 
     def get_optim_params(self) -> Any:
         """The backbone's parameters, and the styles with a learning rate of their own."""
@@ -194,8 +170,8 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
             result = losses
         else:
             result, losses = self.backbone.loss(lesson.batch, style, lesson.weight)
-        numbers = dict(self.backbone.numbers)
-        return result, {**numbers, **(logged(self.steps, lesson, losses) if self.training else {})}
+        own = logged(self.steps, lesson, losses) if self.training else {}
+        return result, {**self.backbone.numbers, **own}
 
     def draw(self, batch: dict[str, Any], steps: int = 1) -> Lesson:
         """What the loss of a batch is computed from, all random draws and bookkeeping included.
@@ -210,7 +186,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         lesson = Lesson.of(batch)
         if self.has_styles:
             self.styles.check_trained(lesson.episode)
-        self._has_learned = True
+        self._has_trained = True
         for step in self.steps:
             lesson = step(lesson, steps)
         return replace(lesson, batch=self._as_outputs(lesson.batch))
@@ -224,7 +200,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if not self.has_styles:
             return None
         style = self.styles(lesson.episode)
-        style = torch.where(lesson.teaches_style.unsqueeze(-1), style, style.detach())
+        style = torch.where(lesson.teaches_style[:, None], style, style.detach())
         return style if lesson.noise is None else style + lesson.noise
 
     def _held_out_lesson(self, batch: dict[str, Any]) -> Lesson:
@@ -257,9 +233,10 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
 
     def _as_outputs(self, batch: dict[str, Any]) -> dict[str, Any]:
         """`batch` with actions as the backbone is to predict them."""
-        if self.relative is None:
-            return batch
-        return {**batch, ACTION: self.relative.encode(batch[ACTION], batch[OBS_STATE])}
+        actions = (
+            batch[ACTION] if self.relative is None else self.relative.encode(batch[ACTION], batch[OBS_STATE])
+        )
+        return {**batch, ACTION: actions}
 
     def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation; training makes encoded styles out of date."""
@@ -295,11 +272,9 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """(B, K, A) normalised actions, now and next."""
         chunk = self.backbone.predict_action_chunk(batch, self._rollout_styles(batch), **kwargs)
-        return (
-            chunk
-            if self.relative is None
-            else torch.stack([self._as_actions(outputs, batch) for outputs in chunk.unbind(1)], dim=1)
-        )
+        if self.relative is None:
+            return chunk
+        return torch.stack([self._as_actions(outputs, batch) for outputs in chunk.unbind(1)], dim=1)
 
     def supports_rtc(self) -> bool:
         """Whether the backbone does LeRobot's real-time chunking."""
@@ -313,14 +288,9 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         """(B, style_dim) styles of the rollout under way."""
         if not self.has_styles:
             return None
-        if self.data is not None and self.data.is_new and not self._has_learned:
-            raise ValueError(
-                f"this policy was created to be trained on {self.data.root}, which is not the dataset of "
-                f"its checkpoint, so its {len(self.styles)} styles are new; to act with the checkpoint's, "
-                "load it without dataset_meta (ds_meta), whatever dataset you evaluate on"
-            )
-        tasks = cast(str | list[str], batch.get("task", []))
-        n_envs = len(batch[OBS_STATE])
+        if not self._has_trained:
+            self._refuse_untrained_styles()
+        n_envs, tasks = len(batch[OBS_STATE]), cast(str | list[str], batch.get("task", []))
         scene = self._scene(batch, n_envs) if self.styles.drawing.sampling == "scene" else None
         return self.styles.active_styles(n_envs, [tasks] * n_envs if isinstance(tasks, str) else tasks, scene)
 

@@ -17,18 +17,16 @@ from lerobot_swr.dataset_checks import check_dimensions, check_frame_numbers, mi
 from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.dataset_statistics import usable_statistics
 from lerobot_swr.pauses import pause_frames
-from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.configuration_swr import BCConfig
 from lerobot_swr.policies.demonstration_frames import DemonstrationFrames, demonstration_frames
 from lerobot_swr.policies.processor_swr import make_bc_pre_post_processors
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.policies.vector_pipelines import vector_pipelines
 from lerobot_swr.run_context import RunContext
-from lerobot_swr.sampling import PartnerSampler, check_partner_sampling
 from lerobot_swr.scene_variation import SceneVariation, scene_variation
-from lerobot_swr.similarity import Similarity, check_normalization, similarity_of
-from lerobot_swr.styles.embedding import MannerEmbedding
+from lerobot_swr.similarity import Similarity, similarity_of
 from lerobot_swr.styles.encoding import Frames
-from lerobot_swr.styles.table import LABELLED_BY, OUTCOMES, StyleTable, make_nearest_table
+from lerobot_swr.styles.table import LABELLED_BY, OUTCOMES
 from lerobot_swr.trajectories import Trajectories, dimension_names, load_trajectories
 
 logger = logging.getLogger(__name__)
@@ -152,7 +150,7 @@ class TrainingData:
         trajectories: All of the dataset's episodes.
         fingerprint: Hash of their states.
         from_checkpoint: Whether the network comes from a checkpoint.
-        is_new: Whether it comes from one that was trained on another dataset.
+        fine_tunes: Whether it comes from one that was trained on another dataset.
         pauses: (F,) bool, which frames are left out; None for none.
     """
 
@@ -162,7 +160,7 @@ class TrainingData:
     trajectories: Trajectories
     fingerprint: str
     from_checkpoint: bool
-    is_new: bool
+    fine_tunes: bool
     pauses: np.ndarray | None
 
     @classmethod
@@ -180,8 +178,8 @@ class TrainingData:
         run = RunContext.current(meta)
         trajectories = read_training_data(config, meta, run, (*OUTCOMES, *LABELLED_BY))
         fingerprint, known = trajectories.fingerprint([OBS_STATE]), config.dataset_fingerprint
-        is_new = known is not None and known != fingerprint
-        if is_new and run.resuming:
+        fine_tunes = known is not None and known != fingerprint
+        if fine_tunes and run.resuming:
             raise ValueError(
                 f"dataset.root={str(meta.root)!r} has {meta.total_episodes} episodes and is not the dataset "
                 f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
@@ -191,7 +189,7 @@ class TrainingData:
         pauses = (
             _find_pauses(trajectories, config) if config.skip_pauses and not config.image_features else None
         )
-        return cls(config, meta, run, trajectories, fingerprint, known is not None, is_new, pauses)
+        return cls(config, meta, run, trajectories, fingerprint, known is not None, fine_tunes, pauses)
 
     @property
     def root(self) -> Path:
@@ -251,54 +249,6 @@ class TrainingData:
         keys = [*self.config.observation_keys, ACTION]
         batch = preprocessor({key: torch.from_numpy(columns[key][rows]) for key in keys})
         return {key: batch[key] for key in keys}
-
-
-def make_sampler(config: WZBCConfig, data: TrainingData) -> PartnerSampler:
-    """Draws partners among the episodes that are trained on.
-
-    Raises:
-        ValueError: If there is a single one.
-    """
-    if len(data.run.episodes) < 2:
-        raise ValueError(
-            f"dataset.root={str(data.root)!r}: a single episode to train on; wzbc compares "
-            "episodes and needs at least 2: record more, leave more in, or use --policy.type=zbc"
-        )
-    assert config.beta is not None
-    return PartnerSampler(
-        data.similarity,
-        np.array(data.run.episodes),
-        config.beta,
-        config.p,
-        check_normalization(config.similarity_normalization),
-        check_partner_sampling(config.partner_sampling),
-    )
-
-
-def make_embedding(config: ZBCConfig, data: TrainingData | None) -> MannerEmbedding:
-    """What gives demonstrations their styles by what similarity compares: of the dataset, or to be loaded.
-
-    Raises:
-        ValueError: If the demonstrations that are trained on are all alike.
-    """
-    columns = config.manner.columns
-    if data is not None:
-        trained = np.array(data.run.episodes)
-        width = data.compared.joined(columns).shape[1]
-        config.embedded_shape = (int(data.compared.lengths[trained].max()), width)
-    if config.embedded_shape is None:
-        raise ValueError("style_init='similarity': this takes effect when a policy is created with a dataset")
-    assert config.style_dim is not None
-    embedding = MannerEmbedding(config.style_dim, *config.embedded_shape)
-    if data is not None:
-        embedding.fit(data.compared.joined(columns), data.compared.lengths, trained)
-    return embedding
-
-
-def make_table(config: ZBCConfig, data: TrainingData) -> StyleTable:
-    """The table of the demonstrations, with the columns that the configuration asks for."""
-    rule, metrics, robot = config.behavior_rule, config.style_metrics, data.meta.robot_type
-    return make_nearest_table(data.trajectories, data.similarity, rule, metrics, robot)
 
 
 def _find_pauses(trajectories: Trajectories, config: BCConfig) -> np.ndarray | None:

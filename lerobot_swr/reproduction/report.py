@@ -17,12 +17,7 @@ from lerobot_swr.reproduction import (
 )
 from lerobot_swr.reproduction.paper import SOURCE
 from lerobot_swr.reproduction.perturbation_curves import plot_perturbations
-from lerobot_swr.reproduction.stored_results import (
-    DatasetDescription,
-    StoredCell,
-    SuiteResults,
-    load_suites,
-)
+from lerobot_swr.reproduction.stored_results import StoredCell, SuiteResults, load_suites
 from lerobot_swr.reproduction.suites import UNPERTURBED
 from lerobot_swr.whole_files import write_whole
 
@@ -192,13 +187,6 @@ def _who_teaches(cell: StoredCell) -> str:
     )
 
 
-def _same_by_chance(demonstrations: DatasetDescription) -> float:
-    """Share of pairs of demonstrations with the same behaviour."""
-    labels = demonstrations.result["behavior"]
-    pairs = sum(labels.count(label) - 1 for label in labels)
-    return pairs / (len(labels) * (len(labels) - 1))
-
-
 def _control(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
     for name, demonstrations in suite.datasets.items():
         cells = suite.evaluations(name)
@@ -250,7 +238,7 @@ def _figures(suite: SuiteResults, pictures: Path) -> Iterator[Section]:
                     "Styles of the first training seed by behaviour, in the plane of their two main "
                     f"directions. Titles: share of styles whose nearest other style belongs to a "
                     f"demonstration of the same behaviour, mean over {seeds} seeds; by chance "
-                    f"{_same_by_chance(demonstrations):.2f}.",
+                    f"{demonstrations.same_by_chance:.2f}.",
                     picture,
                 )
             )

@@ -31,6 +31,13 @@ class DatasetDescription:
         """Label to share of the demonstrations."""
         return histogram(self.result["behavior"])
 
+    @property
+    def same_by_chance(self) -> float:
+        """Share of pairs of demonstrations with the same behaviour."""
+        labels = self.result["behavior"]
+        pairs = sum(labels.count(label) - 1 for label in labels)
+        return pairs / (len(labels) * (len(labels) - 1))
+
 
 @dataclass(frozen=True)
 class StoredCell:

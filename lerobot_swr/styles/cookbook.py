@@ -1,21 +1,19 @@
 """The style cookbook: one trainable style z per demonstration, and how styles are drawn at inference."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling, one_of_each
+from lerobot_swr.styles.drawing import StyleDrawing, StyleSampling
 from lerobot_swr.styles.embedding import MannerEmbedding
-from lerobot_swr.styles.request import StyleRequest, Styles, as_request
+from lerobot_swr.styles.request import BLENDED, StyleRequest, Styles, as_request, check_request
 from lerobot_swr.styles.scenes import Scenes
 from lerobot_swr.styles.selection import ResolvedSelection, StyleSelection
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.trajectories import Trajectories
-
-BLENDED = -1  # stands in `StyleCookbook.active` for a style that is no single episode's
 
 
 class StyleCookbook(nn.Module):
@@ -38,12 +36,10 @@ class StyleCookbook(nn.Module):
         num_episodes: N.
         style_dim: Dimension of z.
         init_scale: Standard deviation of the normal initialisation.
-        sampling: ``uniform`` draws with replacement (eq. 2); ``stratified`` uses each allowed style once, in
-            random order, before any is used again; ``fixed`` takes the allowed styles in their given order,
-            over and over; ``scene`` takes one whose demonstration began most like the rollout does.
+        sampling: How they are drawn; see `StyleDrawing`.
         selection: Which styles may be drawn; by default all that were trained.
         scene_dim: Dimensions of an observation, for ``scene``.
-        near_scenes: How many of the allowed styles that began most like the rollout ``scene`` draws from.
+        near_scenes: As in `StyleDrawing`.
 
     Raises:
         ValueError: For an unknown way of sampling, or a selection that is empty or out of range.
@@ -60,8 +56,8 @@ class StyleCookbook(nn.Module):
         near_scenes: int = 1,
     ):
         super().__init__()
-        self.scenes, self.near_scenes = Scenes(num_episodes, scene_dim), near_scenes
-        self.drawing = StyleDrawing(sampling)
+        self.scenes = Scenes(num_episodes, scene_dim)
+        self.drawing = StyleDrawing(sampling, self.scenes, near_scenes)
         self.embedding = nn.Embedding(num_episodes, style_dim)
         nn.init.normal_(self.embedding.weight, std=init_scale)
         self.embedded: MannerEmbedding | None = None
@@ -146,8 +142,7 @@ class StyleCookbook(nn.Module):
         Raises:
             ValueError: If an episode has no style, or the share is outside 0 to 1.
         """
-        StyleSelection(episodes=(i, j)).check_episodes(len(self))
-        StyleSelection(episodes=(i, j)).resolve(self._is_trained(), None)
+        check_request(StyleRequest((i, j)), self._is_trained(), None, self.embedding.embedding_dim)
         if not 0 <= share <= 1:
             raise ValueError(f"style_interpolate=[{i}, {j}, {share}]: the share must lie in 0 to 1")
         start, end = self.embedding.weight.detach()[[i, j]]
@@ -168,23 +163,9 @@ class StyleCookbook(nn.Module):
         """
         asked = as_request(styles, {} if self.table is None else self.table.filters)
         if asked is not None:
-            self._check(asked)
+            check_request(asked, self._is_trained(), self.table, self.embedding.embedding_dim)
         self.asked, self._change = asked, asked is not None
         self.restart()
-
-    def _check(self, asked: StyleRequest | StyleSelection) -> None:
-        """Refuse a request that cannot be served."""
-        if isinstance(asked, StyleSelection):
-            asked.check_episodes(len(self))
-            asked.resolve(self._is_trained(), self.table)
-        elif asked.named:
-            StyleSelection(episodes=asked.named).check_episodes(len(self))
-            StyleSelection(episodes=asked.named).resolve(self._is_trained(), None)
-        elif asked.vectors is not None and asked.vectors.shape[1:] != self.embedding.weight.shape[1:]:
-            raise ValueError(
-                f"styles of shape {list(asked.vectors.shape)}: this cookbook's have "
-                f"{self.embedding.embedding_dim} dimensions, give (K, {self.embedding.embedding_dim})"
-            )
 
     @contextmanager
     def requested(self, request: StyleRequest) -> Iterator[None]:
@@ -193,9 +174,8 @@ class StyleCookbook(nn.Module):
         Raises:
             ValueError: If an episode has no style.
         """
-        self._check(request)
-        before = self.asked
-        self.asked = request
+        check_request(request, self._is_trained(), self.table, self.embedding.embedding_dim)
+        before, self.asked = self.asked, request
         self.restart()
         try:
             yield
@@ -212,11 +192,8 @@ class StyleCookbook(nn.Module):
         selection = self.asked if isinstance(self.asked, StyleSelection) else self.selection
         known = self._resolved
         if known is None or not known.holds(selection, self.table, self.trained):
-            self._resolved = known = ResolvedSelection(selection, self.table, self.trained.clone(), {})
-        if name not in known.episodes:
-            episodes = selection.resolve(self._is_trained(), self.table, name)
-            known.episodes[name] = torch.tensor(episodes, device=self.trained.device)
-        return known.episodes[name]
+            self._resolved = known = ResolvedSelection(selection, self.table, self.trained.clone())
+        return known.allowed(name)
 
     def _is_trained(self) -> np.ndarray:
         return self.trained.bool().cpu().numpy()
@@ -236,12 +213,7 @@ class StyleCookbook(nn.Module):
         Raises:
             ValueError: If drawing by scene is asked for without scenes.
         """
-        names = self._filter_names(batch_size, tasks)
-        drawn = torch.empty(batch_size, dtype=torch.int64, device=self.trained.device)
-        for name in dict.fromkeys(names):
-            places = [place for place, other in enumerate(names) if other == name]
-            drawn[places] = self._draw_among(self.allowed(name), places, scene, name)
-        return drawn
+        return self._draw_each(self._filter_names(batch_size, tasks), self.allowed, scene)
 
     def _filter_names(self, batch_size: int, tasks: Sequence[str]) -> list[str | None]:
         """The named filter that each environment's task string is, if it is one."""
@@ -249,15 +221,16 @@ class StyleCookbook(nn.Module):
             return [None] * batch_size
         return [task if task in self.table.filters else None for task in tasks] or [None] * batch_size
 
-    def _draw_among(
-        self, allowed: Tensor, places: list[int], scene: Tensor | None, name: str | None = None
+    def _draw_each(
+        self, names: Sequence[str | None], allowed: Callable[[str | None], Tensor], scene: Tensor | None
     ) -> Tensor:
-        """(P,) int64 of the (M,) `allowed`, for the episodes at the P `places` of the (B, c) scenes."""
-        if self.drawing.sampling != "scene":
-            return self.drawing.draw(allowed, len(places), name)
-        if scene is None:
-            raise ValueError("style_sampling='scene': this needs the observations with which rollouts begin")
-        return one_of_each(self.scenes.near(scene[places], allowed, self.near_scenes))
+        """(B,) int64 of the (M,) that are `allowed` to each of B names, for the (B, c) scenes."""
+        drawn = torch.empty(len(names), dtype=torch.int64, device=self.trained.device)
+        for name in dict.fromkeys(names):
+            places = [place for place, other in enumerate(names) if other == name]
+            begun = None if scene is None else scene[places]
+            drawn[places] = self.drawing.draw(allowed(name), len(places), name, begun)
+        return drawn
 
     # --- Rollouts ---
 
@@ -270,8 +243,7 @@ class StyleCookbook(nn.Module):
     ) -> Tensor:
         """(B, style_dim) styles of the rollout under way, drawn at its first action and kept to its end.
 
-        They change before its end where styles are requested, and for an environment whose task string
-        becomes the name of another filter.
+        They change before its end by a request, or where an environment's task string names another filter.
 
         Args:
             batch_size: B.
@@ -317,16 +289,12 @@ class StyleCookbook(nn.Module):
         asked = self.asked
         if asked is None or isinstance(asked, StyleSelection):
             return self.draw(batch_size, tasks, scene), None
-        places = asked.places(self._taken, batch_size)
+        places, device = asked.places(self._taken, batch_size), self.trained.device
         self._taken += batch_size
-        device = self.trained.device
         if asked.vectors is not None:
             return torch.full((batch_size,), BLENDED), asked.vectors.to(device)[places]
         if asked.choices is None:
             return torch.tensor(asked.episodes, device=device)[places], None
-        drawn = torch.empty(batch_size, dtype=torch.int64, device=device)
-        for choice in places.unique().tolist():
-            whose = torch.nonzero(places == choice).squeeze(1).tolist()
-            allowed = torch.tensor(asked.choices[choice], device=device)
-            drawn[whose] = self._draw_among(allowed, whose, scene, f"choice {choice}")
-        return drawn, None
+        choices = {f"choice {k}": torch.tensor(c, device=device) for k, c in enumerate(asked.choices)}
+        names = [f"choice {k}" for k in places.tolist()]
+        return self._draw_each(names, lambda name: choices[str(name)], scene), None

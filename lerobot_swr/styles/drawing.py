@@ -6,6 +6,8 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
+from lerobot_swr.styles.scenes import Scenes
+
 StyleSampling = Literal["uniform", "stratified", "fixed", "scene"]
 SAMPLINGS: tuple[StyleSampling, ...] = get_args(StyleSampling)
 
@@ -16,29 +18,41 @@ class StyleDrawing:
     Args:
         sampling: ``uniform`` draws with replacement (eq. 2); ``stratified`` uses each allowed style once, in
             random order, before any is used again; ``fixed`` takes the allowed styles in their given order,
-            over and over. ``scene`` is the cookbook's, which knows scenes.
+            over and over; ``scene`` takes one whose demonstration began most like the rollout does.
+        scenes: How the demonstrations began, for ``scene``.
+        near_scenes: Of how many that began most like the rollout ``scene`` draws one.
 
     Raises:
         ValueError: For an unknown way of sampling.
     """
 
-    def __init__(self, sampling: StyleSampling):
+    def __init__(self, sampling: StyleSampling, scenes: Scenes | None = None, near_scenes: int = 1):
         check_style_sampling(sampling)
-        self.sampling = sampling
+        self.sampling, self.scenes, self.near_scenes = sampling, scenes, near_scenes
         self._queues: dict[str | None, list[int]] = {}
 
     def restart(self) -> None:
         """Begin anew where styles are drawn in turn: the next draws do not depend on earlier ones."""
         self._queues = {}
 
-    def draw(self, allowed: Tensor, count: int, name: str | None = None) -> Tensor:
+    def draw(
+        self, allowed: Tensor, count: int, name: str | None = None, scene: Tensor | None = None
+    ) -> Tensor:
         """(count,) int64 of the (M,) `allowed`.
 
         Args:
             allowed: Episodes whose styles may be drawn.
             count: Number of draws.
             name: Of the selection that allows them: each is drawn in turn for itself.
+            scene: (count, c) normalised observations with which the episodes begin, for ``scene``.
+
+        Raises:
+            ValueError: If drawing by scene is asked for without scenes.
         """
+        if self.sampling == "scene":
+            if scene is None or self.scenes is None:
+                raise ValueError("style_sampling='scene': this needs the observations that rollouts begin by")
+            return _one_of_each(self.scenes.near(scene, allowed, self.near_scenes))
         if self.sampling == "uniform":
             return allowed[torch.randint(len(allowed), (count,), device=allowed.device)]
         queue = self._queues.setdefault(name, [])
@@ -49,7 +63,7 @@ class StyleDrawing:
         return torch.tensor(queue[:count], device=allowed.device)
 
 
-def one_of_each(choices: Sequence[Tensor]) -> Tensor:
+def _one_of_each(choices: Sequence[Tensor]) -> Tensor:
     """(B,) one of each of B tensors (M_b,), drawn uniformly."""
     places = [torch.randint(len(choice), (1,), device=choice.device) for choice in choices]
     return torch.cat([choice[place] for choice, place in zip(choices, places, strict=True)])

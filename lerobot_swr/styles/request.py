@@ -4,10 +4,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import index
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lerobot_swr.styles.selection import StyleSelection
+from lerobot_swr.styles.table import StyleTable
+
+BLENDED = -1  # stands in `StyleCookbook.active` for a style that is no single episode's
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +79,30 @@ def as_request(styles: Styles, filters: Mapping[str, str]) -> StyleRequest | Sty
     if isinstance(styles, Sequence):
         return StyleRequest([index(episode) for episode in styles])  # type: ignore[arg-type]
     return StyleRequest([index(styles)])
+
+
+def check_request(
+    asked: StyleRequest | StyleSelection, trained: np.ndarray, table: StyleTable | None, style_dim: int
+) -> None:
+    """Refuse a request that cannot be served.
+
+    Args:
+        asked: The request.
+        trained: (N,) bool, which episodes have a style.
+        table: The demonstrations' table, if there is one.
+        style_dim: Dimension of a style.
+
+    Raises:
+        ValueError: If an episode has no style, nothing matches, or vectors have other dimensions.
+    """
+    if isinstance(asked, StyleRequest):
+        if asked.vectors is not None and asked.vectors.shape[1:] != (style_dim,):
+            raise ValueError(
+                f"styles of shape {list(asked.vectors.shape)}: this cookbook's have {style_dim} dimensions, "
+                f"give (K, {style_dim})"
+            )
+        if not asked.named:
+            return
+        asked, table = StyleSelection(episodes=asked.named), None
+    asked.check_episodes(len(trained))
+    asked.resolve(trained, table)

@@ -1,7 +1,7 @@
 """Which styles may be drawn: the selection that flags or Python code describe, resolved to episodes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -126,13 +126,23 @@ class ResolvedSelection:
         selection: The selection.
         table: The table by which it was resolved.
         trained: (N,) which episodes had a style.
-        episodes: Name of a further filter, None for none, to (M,) int64 episodes.
     """
 
     selection: StyleSelection
     table: StyleTable | None
     trained: Tensor
-    episodes: dict[str | None, Tensor]
+    _episodes: dict[str | None, Tensor] = field(default_factory=dict)
+
+    def allowed(self, name: str | None) -> Tensor:
+        """(M,) int64 episodes that match a further filter of this name, too; None for none.
+
+        Raises:
+            ValueError: As `StyleSelection.resolve` does.
+        """
+        if name not in self._episodes:
+            found = self.selection.resolve(self.trained.bool().cpu().numpy(), self.table, name)
+            self._episodes[name] = torch.tensor(found, device=self.trained.device)
+        return self._episodes[name]
 
     def holds(self, selection: StyleSelection, table: StyleTable | None, trained: Tensor) -> bool:
         """Whether it is what the selection would give now."""
