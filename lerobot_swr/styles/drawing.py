@@ -51,7 +51,7 @@ class StyleDrawing:
         """
         if self.sampling == "scene":
             if scene is None or self.scenes is None:
-                raise ValueError("style_sampling='scene': this needs the observations that rollouts begin by")
+                raise ValueError("style_sampling='scene': this needs the observations rollouts begin with")
             return _one_of_each(self.scenes.near(scene, allowed, self.near_scenes))
         if self.sampling == "uniform":
             return allowed[torch.randint(len(allowed), (count,), device=allowed.device)]
