@@ -25,8 +25,6 @@ Importing this package registers the environment, policy and optimizer configura
 shortens one of its log messages (`lerobot_swr.ffmpeg`).
 """
 
-__version__ = "0.2.0.dev0"
-
 import lerobot_swr.envs.d3il.configuration_d3il
 import lerobot_swr.envs.maze2d.configuration_maze2d
 import lerobot_swr.envs.pusht.task
@@ -34,5 +32,8 @@ import lerobot_swr.policies.baselines.configuration_baselines
 import lerobot_swr.policies.configuration_swr
 import lerobot_swr.policies.processor_swr  # noqa: F401
 from lerobot_swr.ffmpeg import shorten_message
+from lerobot_swr.version import __version__
+
+__all__ = ["__version__"]
 
 shorten_message()

@@ -7,6 +7,8 @@ from importlib.metadata import PackageNotFoundError, distribution, distributions
 
 from packaging.requirements import Requirement
 
+from lerobot_swr.version import __version__
+
 DISTRIBUTION = "lerobot_policy_swr"
 # Source: lerobot.utils.import_utils.register_third_party_plugins
 PLUGIN_PREFIXES = (
@@ -16,7 +18,7 @@ PLUGIN_PREFIXES = (
     "lerobot_policy_",
     "lerobot_env_",
 )
-PACKAGES = ("lerobot_policy_swr", "lerobot", "torch", "numpy", "mujoco", "diffusers")  # noted where installed
+PACKAGES = ("lerobot", "torch", "numpy", "mujoco", "diffusers")  # noted where installed
 FOR_DEVELOPERS = ("dev", "docs", "test")
 
 
@@ -79,8 +81,9 @@ def plugins() -> dict[str, str]:
 
 
 def installed_versions() -> dict[str, str]:
-    """Of Python and of those of `PACKAGES` that are installed."""
-    versions = {"python": platform.python_version()}
+    """Of Python, of this package and of those of `PACKAGES` that are installed."""
+    # An editable installation's metadata are those of the day when it was made.
+    versions = {"python": platform.python_version(), DISTRIBUTION: __version__}
     for name in PACKAGES:
         with contextlib.suppress(PackageNotFoundError):
             versions[name] = version(name)

@@ -11,7 +11,7 @@ import lerobot_swr
 PACKAGE = Path(lerobot_swr.__file__).parent
 FLOORS = (
     # What knows nothing of the method.
-    {"errors", "whole_files", "random_streams", "run_context", "dataset_files", "dataset_checks"}
+    {"errors", "whole_files", "version", "random_streams", "run_context", "dataset_files", "dataset_checks"}
     | {"configuration", "dataset_statistics", "behaviors", "scene_variation", "metrics"}
     | {"progress", "ffmpeg", "installation", "checkpoint_files", "object_poses", "user_functions"}
     | {"html_pages"},

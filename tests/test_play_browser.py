@@ -154,7 +154,7 @@ def test_clicked_styles_are_followed_in_mid_rollout(small_maze, trained, monkeyp
             assert person.ask("frame.success")
             assert person.ask("frame.behavior") == behavior == person.ask("frame.requested")
             assert person.browser.find_element("id", "flag").get_attribute("value") == (
-                f"--policy.style_episodes=[{episode}]"
+                f"--policy.style_episodes='[{episode}]'"
             )
         person.browser.find_element("id", "filter").send_keys("lenght > 3")
         person.press("apply")

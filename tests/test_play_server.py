@@ -108,7 +108,7 @@ def closing_code(socket):
         ('{"type": "speed", "factor": 0}', "speed: factor=0: expected a number from 0.1 to 4"),
         ('{"type": "train", "steps": 10000000}', "train: steps"),
         ('{"type": "pause", "on": 1}', "pause: on=1: expected true or false"),
-        (f'{{"type": "filter", "text": "{"x" * MAX_MESSAGE_BYTES}"}}', "at most 16384 bytes"),
+        (f'{{"type": "filter", "text": "{"x" * MAX_MESSAGE_BYTES}"}}', "at most 131072 bytes"),
     ],
 )
 def test_bad_messages_are_refused_by_what_is_wrong_with_them(text, answer):
@@ -191,6 +191,21 @@ def test_the_first_page_steers_and_another_one_can_take_over(address):
         assert "another page steers" in hear(one, "error")["message"]
 
 
+@pytest.mark.parametrize("how", ["takes over", "is left over"])
+def test_what_the_last_page_held_is_let_go(address, how):
+    """Else its pointer would go on pulling, with nobody at it."""
+    with page(address, "one") as one, page(address, "two") as two:
+        hear(two, "role")
+        say(one, HAND)
+        assert json.loads(hear(two, "notice")["message"]) == HAND
+        if how == "takes over":
+            say(two, {"type": "take"})
+        else:
+            one.close()
+        released = json.loads(hear(two, "notice")["message"])
+        assert (released["type"], released["place"], released["push"]) == ("hand", None, [0, 0, 0])
+
+
 def test_a_reload_keeps_the_page_its_place(address):
     """The same tab comes back: it steers at once, and its old connection ends."""
     with page(address, "one") as before, page(address, "one") as after:
@@ -252,8 +267,12 @@ def test_a_dead_worker_is_told_and_started_anew(address, monkeypatch):
     monkeypatch.setattr(hub_module, "SHORTEST_LIFE_S", 0)
     with page(address) as socket:
         say(socket, {"type": "perturb"})
-        assert "what was kept is safe" in hear(socket, "error", 20)["message"]
+        error = hear(socket, "error", 20)
+        assert "what was kept is safe on the disk. It is started anew" in error["message"]
+        assert not error["fatal"]
         hear(socket, "welcome", 30)
+        with page(address, "later") as later:  # to which there is nothing to be told of it
+            assert [json.loads(later.recv(timeout=20))["type"] for _ in range(2)] == ["welcome", "role"]
         say(socket, HAND)
         assert hear(socket, "notice", 20)
 

@@ -1,5 +1,8 @@
 """A session: one environment, a person's or a policy's actions, and what is recorded of it."""
 
+import shlex
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -186,6 +189,18 @@ def test_a_kill_at_any_moment_of_saving_loses_nothing_and_doubles_nothing(tmp_pa
     assert [path.name for path in tmp_path.iterdir() if "lock" not in path.name] == ["mine"]
 
 
+def test_what_was_kept_of_another_kind_is_not_mixed_in(tmp_path):
+    """Demonstrations that were kept elsewhere and not saved; they stay where they are."""
+    root = tmp_path / "mine"
+    writer = DemonstrationWriter(root, KIND)
+    writer.keep(make_demonstration(0))
+    writer.close()
+    other = replace(KIND, robot_type="maze2d_large")
+    with pytest.raises(ValueError, match=r"1 demonstrations kept for it and not saved have robot_type='"):
+        DemonstrationWriter(root, other)
+    assert DemonstrationWriter(root, KIND).save() == 1
+
+
 def _dying_at_second_call(error):
     calls = []
 
@@ -310,9 +325,11 @@ def test_the_driver_steers_and_lets_a_hand_drag(checkpoint):
     driver.handle({"type": "style", "episodes": [4]})
     driver.beat()
     assert heard.frames()[-1]["style"] == 4
-    assert heard.events("state")[-1]["steering"]["flag"] == "--policy.style_episodes=[4]"
+    assert heard.events("state")[-1]["steering"]["flag"] == "--policy.style_episodes='[4]'"
     driver.handle({"type": "filter", "text": "behavior == '10'"})
     driver.beat()
+    flag = heard.events("state")[-1]["steering"]["flag"]
+    assert shlex.split(flag) == ["--policy.style_filter=behavior == '10'"]
     labels = checkpoint.policy.styles.table.columns["behavior"]
     assert labels[heard.frames()[-1]["style"]] == "10" == heard.frames()[-1]["requested"]
     driver.handle({"type": "filter", "text": "lenght > 3"})

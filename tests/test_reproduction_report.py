@@ -194,6 +194,7 @@ def test_published_results_give_the_same_report_without_checkpoints(finished, tm
     target = tmp_path / "published"
     keep_only("table1", finished)
     write_results_report(finished)
+    publish([finished], target)
     write_whole(target / "results" / "stale.json", "{}")
     publish([finished], target)
     assert not (target / "work").exists()
@@ -266,13 +267,13 @@ def test_a_readme_without_markers_is_refused(finished, tmp_path):
         with_block("no markers", "table", tmp_path / "README.md")
 
 
-def test_the_readme_shows_the_published_results():
-    """README's block is what the stored results give: neither stands without the other."""
-    published = REPOSITORY / "docs" / "results" / "human"
-    text = (REPOSITORY / "README.md").read_text()
-    assert (START in text) == published.is_dir()
-    if published.is_dir():
-        assert with_block(text, readme_block(published), REPOSITORY / "README.md") == text
+def test_publishing_deletes_nothing_that_is_no_result(finished, tmp_path):
+    """Somebody's own files in a folder called results."""
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results" / "thesis.txt").write_text("years of work")
+    with pytest.raises(ValueError, match=r"thesis\.txt' is no published result and would be deleted"):
+        publish([finished], tmp_path)
+    assert (tmp_path / "results" / "thesis.txt").read_text() == "years of work"
 
 
 def test_an_empty_folder_is_named(tmp_path, run_command, capsys):

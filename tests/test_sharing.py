@@ -1,7 +1,6 @@
 """Cards of policies and datasets, the folders that carry them, and loading what others made."""
 
 import json
-import shutil
 
 import pytest
 from conftest import save_checkpoint
@@ -117,6 +116,11 @@ def test_a_dataset_is_shared(small_maze, tmp_path, run_command):
     assert DatasetCard(text).data.to_dict()["task_categories"] == ["robotics"]
     assert (folder / "meta" / "info.json").read_bytes() == (small_maze / "meta" / "info.json").read_bytes()
     assert sorted(path.name for path in small_maze.rglob("*")) == before
+    assert not (folder / "meta" / "info.json").samefile(small_maze / "meta" / "info.json")
+    assert "license" not in DatasetCard(text).data.to_dict()
+    again = tmp_path / "licensed"
+    run_command(share, f"--dataset.root={small_maze}", f"--output_dir={again}", "--license=cc-by-4.0")
+    assert DatasetCard((again / "README.md").read_text()).data.license == "cc-by-4.0"
 
 
 @pytest.mark.parametrize("name", ["model.safetensors", "config.json", "styles.parquet"])
@@ -151,18 +155,24 @@ def test_bad_input_is_told_before_any_work(
 
 
 def test_a_folder_is_replaced_only_when_asked(checkpoint, tmp_path, run_command):
-    """And only one that has a card."""
+    """And only one that has our card, and nothing of others."""
     folder = tmp_path / "shared"
     run_command(share, checkpoint, f"--output_dir={folder}")
     with pytest.raises(SystemExit):
         run_command(share, checkpoint, f"--output_dir={folder}")
-    (folder / "old").touch()
+    (folder / "old.png").touch()
     run_command(share, checkpoint, f"--output_dir={folder}", "--overwrite=true")
-    assert not (folder / "old").exists()
-    shutil.rmtree(folder)
-    folder.mkdir()
+    assert not (folder / "old.png").exists()
+    (folder / "thesis.txt").touch()
     with pytest.raises(SystemExit):
         run_command(share, checkpoint, f"--output_dir={folder}", "--overwrite=true")
+    assert (folder / "thesis.txt").exists()
+    project = tmp_path / "project"
+    project.mkdir()
+    (project / "README.md").write_text("# My project")
+    with pytest.raises(SystemExit):
+        run_command(share, checkpoint, f"--output_dir={project}", "--overwrite=true")
+    assert (project / "README.md").read_text() == "# My project"
 
 
 def test_figures_without_interval_are_left_out(results):

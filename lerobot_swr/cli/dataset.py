@@ -98,3 +98,7 @@ def main() -> None:
     """Entry point."""
     init_logging()
     write()
+
+
+if __name__ == "__main__":
+    main()

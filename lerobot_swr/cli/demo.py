@@ -291,3 +291,7 @@ def main() -> None:
     """Entry point."""
     init_logging(console_level="WARNING")
     demo()
+
+
+if __name__ == "__main__":
+    main()

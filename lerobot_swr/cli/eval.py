@@ -122,3 +122,7 @@ def main() -> None:
     sys.argv = list(with_literal_text(sys.argv, TEXT_FLAGS))
     check_dataset_folder()  # the parser would hide what it says
     evaluate()
+
+
+if __name__ == "__main__":
+    main()

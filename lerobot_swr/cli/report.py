@@ -65,3 +65,7 @@ def main() -> None:
     elif named and not named[0].startswith("["):  # a single folder
         sys.argv[sys.argv.index(f"--results={named[0]}")] = f"--results={json.dumps(named)}"
     report()
+
+
+if __name__ == "__main__":
+    main()

@@ -43,3 +43,7 @@ def main() -> None:
     init_logging(console_level="WARNING")
     register_third_party_plugins()
     run()
+
+
+if __name__ == "__main__":
+    main()

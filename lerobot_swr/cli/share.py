@@ -22,10 +22,10 @@ from lerobot_swr.cli.literal_flags import with_literal_text
 from lerobot_swr.configuration import check_checkpoint_path
 from lerobot_swr.evaluation.checkpoint import DatasetSource, load_checkpoint, load_demonstrations
 from lerobot_swr.sharing.dataset_card import PICTURE, dataset_card
-from lerobot_swr.sharing.folders import copy_checkpoint, copy_dataset, copy_pictures, new_folder
+from lerobot_swr.sharing.folders import CARD, copy_checkpoint, copy_dataset, copy_pictures, new_folder
 from lerobot_swr.sharing.measures import find_results
-from lerobot_swr.sharing.policy_card import CARD, policy_card, styles_picture
 from lerobot_swr.sharing.policy_card import PICTURE as STYLES_PICTURE
+from lerobot_swr.sharing.policy_card import policy_card, styles_picture
 
 
 @dataclass
@@ -44,6 +44,9 @@ class ShareCommand:
     repo_id: str | None = None
     # Folder to write; null: outputs/share/<name>.
     output_dir: Path | None = None
+    # The Hub's name of the license (apache-2.0, cc-by-4.0, ...); null: of a policy the checkpoint's, else
+    # LeRobot's apache-2.0; of a dataset the card then says nothing of it.
+    license: str | None = None
     # Replace a folder that this command wrote before.
     overwrite: bool = False
 
@@ -82,6 +85,7 @@ def _share_policy(cfg: ShareCommand) -> tuple[Path, str, str]:
     config = PreTrainedConfig.from_pretrained(cfg.checkpoint)
     config.pretrained_path = cfg.checkpoint
     policy = load_checkpoint(config).policy
+    policy.config.license = cfg.license or policy.config.license
     file = cfg.checkpoint / "train_config.json"
     training = json.loads(file.read_text()) if file.is_file() else {}
     dataset = (training.get("dataset") or {}).get("repo_id")
@@ -105,7 +109,7 @@ def _share_dataset(cfg: ShareCommand) -> tuple[Path, str, str]:
     folder = cfg.output_dir or Path("outputs/share") / repo_id.rpartition("/")[2]
     with new_folder(folder, cfg.overwrite) as new:
         copy_dataset(meta.root, new)
-        card, picture = dataset_card(meta, load_demonstrations(meta), rule, repo_id)
+        card, picture = dataset_card(meta, load_demonstrations(meta), rule, repo_id, cfg.license)
         (new / PICTURE).write_bytes(picture)
         (new / CARD).write_text(card.content, encoding="utf-8")
     return folder, repo_id, "dataset"
@@ -131,3 +135,7 @@ def _as_list(argument: str) -> str:
     if name != "--results" or value.startswith("["):
         return argument
     return f"--results={json.dumps(value.split(','))}"
+
+
+if __name__ == "__main__":
+    main()

@@ -254,3 +254,7 @@ def main() -> None:
         sys.argv[1] = f"--checkpoint={sys.argv[1]}"
     sys.argv = list(with_literal_text(sys.argv, TEXT_FLAGS))
     show_styles()
+
+
+if __name__ == "__main__":
+    main()

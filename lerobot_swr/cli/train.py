@@ -47,3 +47,7 @@ def _with_brackets(arguments: list[str]) -> Iterator[str]:
     joined = re.sub(r"(^|\n)--seeds\n(?=\d)", r"\1--seeds=", "\n".join(arguments))
     for argument in joined.split("\n"):
         yield re.sub(r"^--seeds=(\d+(,\d+)*)$", r"--seeds=[\1]", argument)
+
+
+if __name__ == "__main__":
+    main()

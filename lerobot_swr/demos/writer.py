@@ -5,8 +5,9 @@ import os
 import shutil
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from datasets import disable_progress_bars
@@ -20,6 +21,7 @@ from lerobot_swr.whole_files import replacing, write_whole
 
 ACTION = "action/"  # prefix of no observation
 COMMIT = "commit.json"
+KIND = "kind.json"
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class DemonstrationWriter:
             ) from error
         self._recover()
         check_appendable(self.root, kind)
+        self._check_kept()
 
     @property
     def n_saved(self) -> int:
@@ -88,6 +91,7 @@ class DemonstrationWriter:
         number = int(files[-1].stem) + 1 if files else 0
         path = self._journal / f"{number:06d}.npz"
         columns = {**demonstration.observations, ACTION: demonstration.actions}
+        write_whole(self._journal / KIND, json.dumps(_told(self.kind)))
         with replacing(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, **columns)  # type: ignore[arg-type]
             file.flush()
@@ -161,6 +165,20 @@ class DemonstrationWriter:
         if self._replaced.exists() and self.root.exists():
             shutil.rmtree(self._replaced)
 
+    def _check_kept(self) -> None:
+        """Refuse demonstrations of another kind that were kept and not saved."""
+        file, here = self._journal / KIND, _told(self.kind)
+        if not self._files() or not file.is_file():
+            return
+        there = json.loads(file.read_text())
+        for key, value in there.items():
+            if value != here[key]:
+                raise ValueError(
+                    f"dataset.root={str(self.root)!r}: {len(self._files())} demonstrations kept for it and "
+                    f"not saved have {key}={value!r}, what is recorded here {key}={here[key]!r}: save "
+                    f"them where they were recorded, delete {str(self._journal)!r}, or choose another folder"
+                )
+
     def _files(self) -> list[Path]:
         return sorted(self._journal.glob("[0-9]*.npz"))
 
@@ -201,6 +219,11 @@ def check_appendable(root: Path, kind: DatasetKind) -> None:
                 f"dataset.root={str(root)!r} has {key}={there!r}, what is recorded here {key}={here!r}: they "
                 "cannot be one dataset, choose another folder"
             )
+
+
+def _told(kind: DatasetKind) -> dict[str, Any]:
+    """What demonstrations share, as JSON has it."""
+    return {**asdict(kind), "features": {key: list(names) for key, names in kind.features.items()}}
 
 
 def _rename(old: Path, new: Path) -> None:

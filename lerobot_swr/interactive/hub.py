@@ -19,6 +19,7 @@ MAX_PAGES = 8
 MAX_EVENTS = 64  # that wait for a slow page
 MAX_PER_SECOND = 240  # messages of one page
 STATES = ("welcome", "state", "training")  # what a page that comes later has to know
+HAND_OFF = {"type": "hand", "place": None, "push": [0, 0, 0], "n": 0}
 SHORTEST_LIFE_S = 20  # of a worker that is started anew when it dies
 
 
@@ -97,6 +98,7 @@ class Hub:
         self._training: Training | None = None
         self._tasks: set[asyncio.Task] = set()
         self._is_ending = False
+        self._last_words: str | None = None
         self.failure: str | None = None
         self.give_up: Callable[[], None] = lambda: None
 
@@ -143,14 +145,14 @@ class Hub:
         event = json.loads(said[1:])
         if event["type"] == "train":
             self._train(Path(event["root"]), event["steps"], self._behavior_rule or event["behavior_rule"])
-            return
-        self._broadcast(event)
+        elif event.get("fatal"):
+            self._last_words = event["message"]  # told when it has ended
+        else:
+            self._broadcast(event)
 
     def _broadcast(self, event: dict[str, Any]) -> None:
         if event["type"] in STATES:
             self._states[event["type"]] = event
-        if event.get("fatal"):
-            self._states["error"] = event
         for page in self.pages:
             page.tell(event)
 
@@ -164,17 +166,20 @@ class Hub:
     def _lose_worker(self) -> None:
         assert self._process is not None
         self._process.join(3)
+        why, self._last_words = self._last_words, None
         if self._process.exitcode == 2 and "welcome" not in self._states:
-            self.failure = self._states.get("error", {}).get("message")
+            self.failure = why
             self.give_up()
             return
         again = self._loop.time() - self._born > SHORTEST_LIFE_S and self._process.exitcode != 2
-        message = "the environment's process has ended; what was kept is safe on the disk. "
+        message = f"{why or "the environment's process has ended"}; what was kept is safe on the disk. "
         message += "It is started anew." if again else "End the command and start it again."
-        if "error" not in self._states:
-            self._broadcast({"type": "error", "message": message, "fatal": not again})
+        event = {"type": "error", "message": message, "fatal": not again}
+        self._broadcast(event)
         if again:
             self.start()
+        else:
+            self._states["error"] = event  # for pages that come later, too
 
     # --- Pages ---
 
@@ -200,7 +205,7 @@ class Hub:
             return
         self.pages.remove(page)
         if self.pilot is page:
-            self.pilot = self.pages[-1] if self.pages else None
+            self._hand_over(self.pages[-1] if self.pages else None)
         self._tell_roles()
 
     def hear_page(self, page: Page, text: str | bytes | None) -> None:
@@ -214,7 +219,7 @@ class Hub:
             page.tell({"type": "error", "message": str(error)})
             return
         if message["type"] == "take":
-            self.pilot = page
+            self._hand_over(page)
             self._tell_roles()
         elif page is not self.pilot:
             page.tell({"type": "error", "message": "another page steers; press 'Take over' to steer here"})
@@ -223,6 +228,12 @@ class Hub:
                 self._training.stop()
         else:
             self._send(message)
+
+    def _hand_over(self, page: Page | None) -> None:
+        """Let another page steer; what the last one held is let go."""
+        if page is not self.pilot:
+            self._send(HAND_OFF)
+        self.pilot = page
 
     def _tell_roles(self) -> None:
         self._send({"type": "watched", "count": len(self.pages)})

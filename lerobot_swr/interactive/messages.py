@@ -4,8 +4,8 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
-MAX_MESSAGE_BYTES = 16_384
-MAX_EPISODES = 2_000  # of one request
+MAX_MESSAGE_BYTES = 131_072
+MAX_EPISODES = 10_000  # of one request; page.js knows it, too
 MAX_TEXT = 1_000
 MAX_STEPS = 1_000_000
 

@@ -72,7 +72,10 @@ async function decode() {
 }
 const colours = new Map();
 function colourOf(behavior) {
-  if (!colours.has(behavior)) colours.set(behavior, palette[colours.size % palette.length]);
+  if (!colours.has(behavior)) {
+    const k = colours.size;  // more behaviours than the palette has: turns by the golden angle
+    colours.set(behavior, palette[k] || `hsl(${Math.round(k * 137.5) % 360} 65% ${k % 2 ? 35 : 60}%)`);
+  }
   return colours.get(behavior);
 }
 function line(path, colour, width, alpha, dash = []) {
@@ -284,6 +287,7 @@ function drawMapOptions() {
 }
 const escaped = value => String(value === "" ? "(none)" : value).slice(0, 80)
   .replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;");
+const maxEpisodes = 10000;  // as messages.py has it
 let mapIsHeard = false;
 function drawMap() {
   const {map} = scene, column = byId("color").value, values = map.columns[column] || map.episodes;
@@ -313,7 +317,8 @@ function drawMap() {
   byId("map").on("plotly_unhover", () => { hovered = null; });
   byId("map").on("plotly_selected", event => {
     if (!event || !event.points.length) return;
-    send("style", {episodes: event.points.map(point => point.customdata)});
+    if (event.points.length > maxEpisodes) say(`At most ${maxEpisodes} styles at once; type a filter for more.`, true);
+    else send("style", {episodes: event.points.map(point => point.customdata)});
     Plotly.relayout("map", {selections: []});
   });
 }

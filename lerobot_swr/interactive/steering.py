@@ -1,5 +1,6 @@
 """Steering mode: what is known of a policy's styles, what was asked of it, and what it showed."""
 
+import shlex
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from typing import Any
@@ -42,7 +43,7 @@ class Steering:
     def request(self, episodes: Sequence[int]) -> None:
         """Ask for the styles of some episodes, from the next step on."""
         self._session.steer(list(episodes))
-        self._ask(list(episodes), f"--policy.style_episodes=[{','.join(map(str, episodes))}]")
+        self._ask(list(episodes), f"--policy.style_episodes='[{','.join(map(str, episodes))}]'")
 
     def request_filter(self, text: str) -> None:
         """Ask for the styles that match a filter, or the filter of that name."""
@@ -51,7 +52,7 @@ class Steering:
         text = text.strip()
         matching = styles.filter(named.get(text, text))
         self._session.steer(text)
-        self._ask(matching, f'--policy.style_filter="{named.get(text, text)}"')
+        self._ask(matching, f"--policy.style_filter={shlex.quote(named.get(text, text))}")
 
     def free(self) -> None:
         """Let styles be drawn again, from the next rollout on."""

@@ -30,10 +30,12 @@ def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = 
 
     Raises:
         FileNotFoundError: If a source has no results.
-        ValueError: If a source and the target are the same folder, or no suite is left.
+        ValueError: If a source and the target are the same folder, no suite is left, or the target has other
+            files where results are written.
     """
     if target.resolve() in [source.resolve() for source in sources]:
         raise ValueError(f"publish={str(target)!r}: is the folder of the results itself; choose another one")
+    _refuse_foreign(target)
     manifests: dict[str, dict[str, Any]] = {}
     origin: dict[str, Path] = {}
     for source in sources:
@@ -54,6 +56,19 @@ def publish(sources: Sequence[Path], target: Path, only: Sequence[str] | None = 
         for file in (*manifest["datasets"].values(), *manifest["cells"]):
             if file in origin:  # others are not finished
                 shutil.copy(origin[file], target / "results")
+
+
+def _refuse_foreign(target: Path) -> None:
+    """Refuse to replace what is no published result."""
+    there = [*target.glob("results/*"), *target.glob("suites/*")]
+    others = [file for file in there if file.suffix != ".json" or not file.is_file()]
+    if not others and any(target.glob("suites/*.json")):
+        return
+    for file in others or there:
+        raise ValueError(
+            f"publish={str(target)!r}: {str(file)!r} is no published result and would be deleted; choose "
+            "another folder"
+        )
 
 
 def _merged(first: dict[str, Any], second: dict[str, Any], finished: Mapping[str, Path]) -> dict[str, Any]:

@@ -67,12 +67,18 @@ def write_results_report(root: Path) -> Path:
         "Reproducing and controlling the diversity of demonstrations",
         INTRODUCTION,
         sections,
-        [*dict.fromkeys(commands), f"lerobot-swr-report {root}"],
+        [*dict.fromkeys(commands), f"lerobot-swr-report {_told(root)}"],
         _versions(suites),
     )
     write_report(report, *content)
     write_markdown(root / "report.md", *content)
     return report
+
+
+def _told(root: Path) -> Path:
+    """A folder as others may call it, too: from here, or by its name alone."""
+    here = Path.cwd()
+    return root.resolve().relative_to(here) if root.resolve().is_relative_to(here) else Path(root.name)
 
 
 def _diversity(suite: SuiteResults, pictures: Path) -> Iterator[Section]:

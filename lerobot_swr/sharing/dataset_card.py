@@ -9,6 +9,7 @@ from lerobot.datasets import LeRobotDatasetMetadata
 
 from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.evaluation.metrics import success_interval
+from lerobot_swr.sharing.folders import TAG
 from lerobot_swr.sharing.markdown import code, escaped, table
 from lerobot_swr.sharing.pictures import draw_groups
 from lerobot_swr.sharing.policy_card import INSTALL, MAX_BEHAVIORS
@@ -20,7 +21,11 @@ PICTURE = "demonstrations.png"
 
 
 def dataset_card(
-    meta: LeRobotDatasetMetadata, trajectories: Trajectories, rule: BehaviorRule | None, repo_id: str
+    meta: LeRobotDatasetMetadata,
+    trajectories: Trajectories,
+    rule: BehaviorRule | None,
+    repo_id: str,
+    license_: str | None = None,
 ) -> tuple[DatasetCard, bytes]:
     """The card, and the picture (PNG) that it shows.
 
@@ -29,11 +34,12 @@ def dataset_card(
         trajectories: Its states and actions.
         rule: Labels a demonstration; None where no rule is known.
         repo_id: Its name on the Hub.
+        license_: The Hub's name of its license; None says nothing of it.
     """
     data = DatasetCardData(
-        license="apache-2.0",
+        license=license_,
         task_categories=["robotics"],
-        tags=["LeRobot", "lerobot_policy_swr"],
+        tags=["LeRobot", TAG],
         configs=[{"config_name": "default", "data_files": "data/*/*.parquet"}],
     )
     labels: list[Value] = [] if rule is None else [rule(episode) for episode in trajectories.episodes()]

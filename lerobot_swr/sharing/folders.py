@@ -5,6 +5,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from fnmatch import fnmatch
 from pathlib import Path
 
 from lerobot_swr.checkpoint_files import check_files
@@ -12,6 +13,9 @@ from lerobot_swr.checkpoint_files import check_files
 POLICY_FILES = ("*.safetensors", "*.json", "*.yaml", "styles.parquet")
 """What a checkpoint consists of; everything in it is data, none of it is run when it is loaded."""
 DATASET_PARTS = ("meta", "data", "videos", "images")
+CARD = "README.md"
+TAG = "lerobot_policy_swr"
+"""Of every card that this package writes."""
 
 
 @contextmanager
@@ -20,12 +24,12 @@ def new_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
 
     Args:
         folder: Its place.
-        overwrite: Replace one that this command wrote before (it holds a README.md).
+        overwrite: Replace one that this command wrote before.
 
     Raises:
         FileExistsError: If it exists and is not to be replaced.
     """
-    is_own = (folder / "README.md").is_file()
+    is_own = folder.is_dir() and _is_shared(folder)
     if folder.exists() and not (overwrite and is_own):
         advice = "pass --overwrite=true to replace it" if is_own else "choose another folder"
         raise FileExistsError(f"output_dir={str(folder)!r} already exists; {advice}")
@@ -37,6 +41,15 @@ def new_folder(folder: Path, overwrite: bool) -> Iterator[Path]:
         if folder.exists():
             folder.rename(Path(work) / "old")
         new.rename(folder)
+
+
+def _is_shared(folder: Path) -> bool:
+    """Whether a folder holds one of our cards, and nothing but what comes with it."""
+    card = folder / CARD
+    if not card.is_file() or TAG not in card.read_text(encoding="utf-8", errors="replace"):
+        return False
+    patterns = (*POLICY_FILES, *DATASET_PARTS, CARD, "*.png", ".gitattributes")
+    return all(any(fnmatch(file.name, pattern) for pattern in patterns) for file in folder.iterdir())
 
 
 def copy_checkpoint(checkpoint: Path, folder: Path) -> None:
@@ -52,10 +65,11 @@ def copy_checkpoint(checkpoint: Path, folder: Path) -> None:
 
 
 def copy_dataset(root: Path, folder: Path) -> None:
-    """A dataset's own files, as links where the disk allows, since recordings are large."""
+    """A dataset's own files; recordings, which are large, as links where the disk allows."""
     for part in DATASET_PARTS:
         if (root / part).is_dir():
-            shutil.copytree(root / part, folder / part, copy_function=_link_or_copy)
+            copy = shutil.copy2 if part == "meta" else _link_or_copy
+            shutil.copytree(root / part, folder / part, copy_function=copy)
 
 
 def copy_pictures(places: Sequence[Path], folder: Path) -> list[str]:

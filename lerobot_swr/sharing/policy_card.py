@@ -2,6 +2,7 @@
 
 import json
 import logging
+import shlex
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from huggingface_hub import HfApi, ModelCard, ModelCardData
 
 from lerobot_swr.html_pages import principal_components
 from lerobot_swr.installation import installed_versions
+from lerobot_swr.sharing.folders import CARD, TAG
 from lerobot_swr.sharing.markdown import code, escaped, table
 from lerobot_swr.sharing.measures import ResultFile
 from lerobot_swr.sharing.pictures import draw_groups
@@ -19,7 +21,7 @@ from lerobot_swr.styles.filters import describe_column
 from lerobot_swr.styles.table import StyleTable
 from lerobot_swr.whole_files import write_whole
 
-CARD, PICTURE = "README.md", "styles.png"
+PICTURE = "styles.png"
 INSTALL = "pip install lerobot_policy_swr"
 MAX_BEHAVIORS = 30
 TRAINING_KEYS = ("steps", "batch_size", "seed")
@@ -53,7 +55,7 @@ def policy_card(
     config = policy.config
     name = repo_id or config.repo_id or "PATH_OR_REPO"
     dataset = dataset or _dataset_name(policy)
-    tags = sorted({"robotics", "lerobot", "lerobot_policy_swr", config.type, *(config.tags or ())})
+    tags = sorted({"robotics", "lerobot", TAG, config.type, *(config.tags or ())})
     data = ModelCardData(
         license=config.license or "apache-2.0",
         library_name="lerobot",
@@ -189,28 +191,21 @@ def _use(policy: Any, name: str) -> list[str]:
     behaviors = [known.columns["behavior"][i] for i in episodes] if "behavior" in known.columns else []
     if behaviors:
         label = Counter(behaviors).most_common(1)[0][0]
-        flags.append((f'--policy.style_filter="behavior == {json.dumps(label)}"', "this behaviour"))
+        flags.append(
+            (f"--policy.style_filter={shlex.quote(f'behavior == {json.dumps(label)}')}", "this behaviour")
+        )
     lengths = np.array([known.columns["length"][i] for i in episodes], dtype=float)
     flags += [
-        (f'--policy.style_filter="length <= {np.median(lengths):g}"', "the shorter demonstrations' styles"),
+        (f"--policy.style_filter='length <= {np.median(lengths):g}'", "the shorter demonstrations' styles"),
         (
             f"--policy.style_like={episodes[0]} --policy.style_neighbours=5",
             "a style and those nearest to it",
         ),
         ("--policy.style_sampling=stratified", "every style once before any again"),
     ]
-    lines += code(*(f"{_quoted(flag)}  # {meaning}" for flag, meaning in flags))
+    lines += code(*(f"{flag}  # {meaning}" for flag, meaning in flags))
     lines += ["", f"Filters know: {', '.join(f'`{key}`' for key in known.columns)}."]
     return lines
-
-
-def _quoted(flag: str) -> str:
-    """A filter whose strings are in double quotes, in single ones for the shell."""
-    name, _, value = flag.partition("=")
-    if not value.startswith('"'):
-        return flag
-    inner = value[1:-1]
-    return f"{name}='{inner}'" if '"' in inner and "'" not in inner else flag
 
 
 def _provenance(policy: Any, dataset: str | None, training: dict[str, Any] | None) -> list[str]:
