@@ -13,6 +13,7 @@ import numpy as np
 SMALLEST_SHARE = 0.05  # of a dimension's standard deviation: what differs less at the start says no scene
 LARGE_SHARE = 0.3  # from which on scenes are said to vary
 MOST_FRAMES = 200_000  # that give the standard deviations of all
+SPOILED = 0.05  # of the demonstrations, which may begin anywhere
 NOISE = 2.0  # how many times its change to the next frame a difference between starts must be
 
 logger = logging.getLogger(__name__)
@@ -23,8 +24,8 @@ class SceneVariation:
     """How each dimension of the observation varies at the start.
 
     Attributes:
-        shares: (d,) standard deviation of the first frames over that of all frames; 0 where that is noise, or
-            little, or nothing.
+        shares: (d,) spread of the first frames over the standard deviation of all frames; 0 where that is
+            noise, or little, or nothing.
         names: d names of the dimensions.
     """
 
@@ -49,6 +50,17 @@ class SceneVariation:
         )
 
 
+def robust_spread(values: np.ndarray) -> np.ndarray:
+    """(d,) standard deviation of (N, d) values without the few that are farthest from the median.
+
+    One demonstration that was recorded backwards does not make a fixed start a varying one.
+    """
+    count = len(values)
+    left_out = min(int(np.ceil(SPOILED * count)), (count - 1) // 2)
+    nearest = np.argsort(np.abs(values - np.median(values, axis=0)), axis=0, kind="stable")
+    return np.take_along_axis(values, nearest[: count - left_out], axis=0).std(axis=0)
+
+
 def scene_variation(
     frames: np.ndarray, lengths: np.ndarray, names: Sequence[str] | None = None
 ) -> SceneVariation:
@@ -63,8 +75,9 @@ def scene_variation(
     first = frames[starts].astype(np.float64)
     second = frames[starts + np.minimum(1, lengths - 1)].astype(np.float64)
     some = frames[:: -(-len(frames) // MOST_FRAMES)]  # no second copy of very many
-    spread, overall = first.std(axis=0), some.std(axis=0, dtype=np.float64)
-    change = np.sqrt(np.square(second - first).mean(axis=0))
+    spread, overall = robust_spread(first), some.std(axis=0, dtype=np.float64)
+    changes = second - first
+    change = robust_spread(np.concatenate([changes, -changes]))  # about 0
     shares = np.divide(spread, overall, out=np.zeros_like(spread), where=overall > 0)
     rounding = 1e-6 * np.abs(first).max(axis=0, initial=0)
     shares[(shares < SMALLEST_SHARE) | (spread < NOISE * change) | (spread <= rounding)] = 0

@@ -136,6 +136,25 @@ def test_a_scene_varies_where_starts_differ_by_more_than_noise():
     assert not scene_variation(frames[:, 1:], lengths).vary
 
 
+@pytest.mark.parametrize("count", [10, 29, 100])
+def test_one_reversed_demonstration_makes_no_varying_scene(count: int):
+    """A demonstration that was recorded backwards does not change what a fixed start says."""
+    rng = np.random.default_rng(0)
+    lengths = rng.integers(40, 80, size=count)
+    paths = [np.linspace(0, 1, n)[:, None] + 0.002 * rng.normal(size=(n, 1)) for n in lengths]
+    assert not scene_variation(np.concatenate(paths), lengths).vary
+    paths[3] = paths[3][::-1]
+    assert not scene_variation(np.concatenate(paths), lengths).vary
+
+
+def test_rare_tasks_are_scenes():
+    """One of twelve tasks, as ones and zeros, varies although each of them is rare."""
+    tasks = np.eye(12)[np.arange(60) % 12]
+    found = scene_variation(np.repeat(tasks, 20, axis=0), np.full(60, 20))
+    assert found.vary
+    assert (found.shares > 0.5).all()
+
+
 @pytest.mark.parametrize(
     ("vary", "dim", "sampling", "beta"), [(True, 10, "scene", 20.0), (False, 10, "uniform", 10.0)]
 )
