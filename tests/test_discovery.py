@@ -6,41 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sklearn.metrics import adjusted_rand_score
+from ways import STATE, dataset, one_way, three_ways, way
 
-from lerobot_swr.discovery.clusters import split, support
 from lerobot_swr.discovery.discover import OUTLIER, Discovery, discover, named
 from lerobot_swr.discovery.paths import walk
+from lerobot_swr.discovery.report import compared_by, no_groups
 from lerobot_swr.discovery.sources import Source
 from lerobot_swr.trajectories import Trajectories
 
-STATE = "observation.state"
 REFERENCE = Path(os.environ.get("LEROBOT_SWR_REFERENCE", "../shared"))
-
-
-def way(via: np.ndarray, rng: np.random.Generator, start: np.ndarray | None = None) -> np.ndarray:
-    """(T, 2) from a start by way of a point to (1, 1), at a varying pace, with a pause."""
-    frames = int(rng.integers(50, 120))
-    corners = np.stack([np.zeros(2) if start is None else start, via, np.ones(2)])
-    pace = np.exp(0.4 * rng.standard_normal(frames)).cumsum()
-    place = (pace - pace[0]) / (pace[-1] - pace[0])
-    place = np.insert(place, frames // 2, np.full(rng.integers(0, 15), place[frames // 2]))
-    path = np.stack([np.interp(place, [0, 0.5, 1], corners[:, k]) for k in range(2)], axis=1)
-    return path + 0.002 * rng.standard_normal(path.shape)
-
-
-def dataset(episodes: list[np.ndarray], **more: list[np.ndarray]) -> Trajectories:
-    """Episodes (T_i, d) as a dataset."""
-    columns = {STATE: np.concatenate(episodes).astype(np.float32)}
-    columns |= {key: np.concatenate(values).astype(np.float32) for key, values in more.items()}
-    return Trajectories(np.array([len(e) for e in episodes]), columns, 10, "memory")
-
-
-def three_ways(count: int = 40, seed: int = 0) -> tuple[list[np.ndarray], list[str]]:
-    """Episodes over the left, the middle and the right, of unequal shares, and their labels."""
-    rng = np.random.default_rng(seed)
-    points = {"left": np.array([0.1, 0.9]), "middle": np.array([0.5, 0.5]), "right": np.array([0.9, 0.1])}
-    labels = rng.choice(list(points), count, p=[0.5, 0.3, 0.2]).tolist()
-    return [way(points[label] + 0.03 * rng.standard_normal(2), rng) for label in labels], labels
 
 
 @pytest.fixture(scope="module")
@@ -66,16 +40,6 @@ def test_the_most_frequent_behaviour_is_the_first(found):
     assert all(discovery.groups[episode] == k for k, episode in enumerate(discovery.medoids))
 
 
-def test_one_way_is_one_behaviour():
-    """Spread-out starts and noise do not make several behaviours of one."""
-    rng = np.random.default_rng(1)
-    episodes = [
-        way(np.array([0.5, 0.6]) + 0.1 * rng.standard_normal(2), rng, rng.uniform(-0.2, 0.2, 2))
-        for _ in range(50)
-    ]
-    assert len(discover(dataset(episodes), Source((STATE,))).names) == 1
-
-
 def test_the_scene_is_no_behaviour():
     """Where an object lies at random, the way around it is found, not the place of the object."""
     rng = np.random.default_rng(2)
@@ -90,6 +54,28 @@ def test_the_scene_is_no_behaviour():
     assert len(discovery.features.scene)
     assert len(discovery.names) == 2
     assert adjusted_rand_score(labels, discovery.labels) > 0.9
+
+
+def test_where_one_begins_is_a_behaviour_if_that_shows_clearly():
+    """Starts on one of two sides are two ways; the report says that the scene was left in."""
+    rng = np.random.default_rng(4)
+    sides = rng.choice([-1.0, 1.0], 30)
+    starts = [np.array([0.2, -0.2]) * side + 0.01 * rng.standard_normal(2) for side in sides]
+    episodes = [way(np.array([0.5, 0.5]) + 0.02 * rng.standard_normal(2), rng, start) for start in starts]
+    discovery = discover(dataset(episodes), Source((STATE,)))
+    assert adjusted_rand_score(sides, discovery.labels) == 1
+    assert compared_by(discovery).endswith(
+        "the scene at the start included, since that shows clearly better groups"
+    )
+
+
+def test_another_task_is_not_called_a_part_of_this_one():
+    """A path that goes elsewhere is far from any, although its beginning is like the others'."""
+    episodes, _ = three_ways(40, seed=3)
+    elsewhere = way(np.array([-0.6, -0.5]), np.random.default_rng(0))
+    elsewhere -= np.linspace(0, 1, len(elsewhere))[:, None] * np.array([2.0, 1.2])
+    reason = discover(dataset([*episodes, elsewhere]), Source((STATE,))).reasons[40]
+    assert reason.startswith("path far from any")
 
 
 def test_spoiled_episodes_are_outliers_with_a_reason():
@@ -124,7 +110,16 @@ def test_every_episode_gets_a_behaviour_if_no_outliers_are_wanted():
 def test_the_number_of_behaviours_can_be_given():
     """K behaviours are made if K are asked for."""
     episodes, _ = three_ways(30, seed=5)
-    assert len(discover(dataset(episodes), Source((STATE,)), num_behaviors=2).names) == 2
+    two = discover(dataset(episodes), Source((STATE,)), num_behaviors=2)
+    assert len(two.names) == 2
+    assert not no_groups(two)
+
+
+def test_parts_of_one_cloud_are_told():
+    """Behaviours that were asked for where there is one way are said to be no groups."""
+    parts = discover(dataset(one_way(30)), Source((STATE,)), num_behaviors=3)
+    assert len(parts.names) == 3
+    assert no_groups(parts).startswith("The data show no 3 groups: these behaviours are parts of one cloud")
 
 
 def last_state(episode) -> np.ndarray:
@@ -184,15 +179,13 @@ def test_pace_does_not_change_a_path():
     assert np.abs(walk(line, 50) - walk(line[::2], 50)).max() < 0.05
 
 
-def test_support_finds_the_number_of_clouds():
-    """Clouds of points are counted; a single one, normal or uniform, is not split."""
-    rng = np.random.default_rng(0)
-    centres = rng.uniform(-10, 10, (5, 3))
-    points = np.concatenate([centre + rng.standard_normal((20, 3)) for centre in centres])
-    assert support(points, rng).best(0.05, 0.85)[0] == 5
-    assert len(np.unique(split(points, 5))) == 5
-    for cloud in (rng.standard_normal((80, 3)), rng.uniform(size=(80, 3))):
-        assert support(cloud, rng).best(0.05, 0.85)[0] == 1
+def test_waiting_is_no_way():
+    """An episode that waits before it begins and after its end has the path of one that does not."""
+    line = np.linspace(0, 1, 60)[:, None] * np.array([[1.0, 2.0]])
+    waits = np.concatenate([np.repeat(line[:1], 80, axis=0), line, np.repeat(line[-1:], 200, axis=0)])
+    assert np.abs(walk(line, 50) - walk(waits, 50)).max() < 0.05
+    still = np.repeat(line[:1], 50, axis=0)
+    assert np.array_equal(walk(still, 50), still)
 
 
 def test_human_orders_of_inserting_are_found():

@@ -5,10 +5,12 @@ Groups are those of Ward's hierarchical clustering. For every number of groups t
 * Are the groups better separated than chance would make them? The mean silhouette s, corrected for the s₀
   that the same clustering finds in data without groups that have the same spread in the same directions
   (normal and uniform, the higher of the two): (s - s₀) / (1 - s₀). This is the idea of the gap statistic.
+  It has to be large, and large compared with what it varies by in data without groups.
 * Would other episodes have given the same groups? The mean adjusted Rand index with clusterings of 80 %.
 
-The number with the largest product is taken, if both are large enough; otherwise there is one group. Each
-group is then looked at by itself, more strictly, since large differences hide small ones.
+The fewest groups whose product of the two is the largest, up to a part of its standard error, are taken, if
+both are large enough; otherwise there is one group. Each group is then looked at by itself, more strictly,
+since large differences hide small ones.
 """
 
 from collections.abc import Callable
@@ -17,16 +19,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist, squareform
-from sklearn.metrics import adjusted_rand_score, silhouette_score
 from sklearn.neighbors import NearestNeighbors
 
 MOST_GROUPS = 50
+FEWEST_EACH = 3  # episodes of a group, on average
 LOOKED_AT = 1000  # episodes, drawn at random, by which the number of groups is chosen
 CLUSTERED = 10_000  # episodes that are clustered; further ones join the group of the nearest of these
-REFERENCES = 4  # data sets without groups, of each kind
-SUBSAMPLES, SHARE = 8, 0.8
+DRAWS = (4, 24)  # least and most data sets without groups, of each kind, and subsamples, ...
+DRAWN = 2500  # ... as many as hold so many episodes together
+SHARE = 0.8  # of the episodes, in a subsample
 LEAST_SEPARATION, LEAST_STABILITY = 0.1, 0.85
 WITHIN_SEPARATION, WITHIN_STABILITY = 0.3, 0.95  # for groups within a group
+CLEAR = 0.25  # separation from which on groups are clear
+BEYOND_CHANCE = 1.5, 5.0  # standard deviations beyond chance, of groups that are clear, and of others
+WITHIN_ERROR = 0.5  # standard errors by which the score of fewer groups may be lower than the largest one
 SMALLEST_PARENT = 10  # episodes of a group that is looked at by itself
 
 
@@ -36,25 +42,45 @@ class Support:
 
     Attributes:
         numbers: (M,) numbers of groups.
-        separation: (M,) silhouettes corrected for chance.
+        silhouettes: (M, N) of each episode, corrected for chance.
+        chance: (M,) standard deviation of the mean silhouette in data without groups, in the same units.
         stability: (M,) agreement of subsamples.
     """
 
     numbers: np.ndarray
-    separation: np.ndarray
+    silhouettes: np.ndarray
+    chance: np.ndarray
     stability: np.ndarray
 
     @property
+    def separation(self) -> np.ndarray:
+        """(M,) mean silhouettes."""
+        return self.silhouettes.mean(axis=1)
+
+    @property
     def score(self) -> np.ndarray:
-        """(M,) their product."""
+        """(M,) separation times stability."""
         return self.separation.clip(0) * self.stability.clip(0)
 
+    def supported(self, least_separation: float, least_stability: float) -> np.ndarray:
+        """(M,) bool, numbers of groups that are separated, beyond chance, and stable."""
+        far = np.where(self.separation >= CLEAR, *BEYOND_CHANCE)
+        return (
+            (self.separation >= least_separation)
+            & (self.separation >= far * self.chance)
+            & (self.stability >= least_stability)
+        )
+
     def best(self, least_separation: float, least_stability: float) -> tuple[int, float]:
-        """The supported number with the largest score, and this; (1, 0) if none is supported."""
-        good = (self.separation >= least_separation) & (self.stability >= least_stability)
+        """The fewest supported groups of about the largest score, and this; (1, 0) if none is supported."""
+        good = self.supported(least_separation, least_stability)
         if not good.any():
             return 1, 0.0
-        place = int(np.where(good, self.score, -1.0).argmax())
+        largest = int(np.where(good, self.score, -1.0).argmax())
+        differences = self.silhouettes[largest] - self.silhouettes  # (M, N)
+        errors = differences.std(axis=1) / np.sqrt(differences.shape[1])
+        enough = self.score >= self.score[largest] - WITHIN_ERROR * errors
+        place = int(np.flatnonzero(good & enough)[0])
         return int(self.numbers[place]), float(self.score[place])
 
 
@@ -68,41 +94,70 @@ def support(points: np.ndarray, rng: np.random.Generator, most: int = MOST_GROUP
     """
     if len(points) > LOOKED_AT:
         points = points[rng.choice(len(points), LOOKED_AT, replace=False)]
-    numbers = np.arange(2, min(most, len(points) // 2) + 1)
+    numbers, count = np.arange(2, min(most, len(points) // FEWEST_EACH) + 1), len(points)
     if not len(numbers) or not points.std(axis=0).any():
-        return Support(numbers[:0], np.zeros(0), np.zeros(0))
+        return Support(numbers[:0], np.zeros((0, count)), np.zeros(0), np.zeros(0))
     silhouettes, groups = _silhouettes(points, numbers)
-    spread = points.std(axis=0)
-    draws: list[Callable[[], np.ndarray]] = [
+    spread, draws = points.std(axis=0), int(np.clip(DRAWN // count, *DRAWS))
+    kinds: list[Callable[[], np.ndarray]] = [
         lambda: rng.standard_normal(points.shape) * spread,
         lambda: rng.uniform(-(3**0.5), 3**0.5, points.shape) * spread,
     ]
-    chance = np.max(
-        [np.mean([_silhouettes(draw(), numbers)[0] for _ in range(REFERENCES)], axis=0) for draw in draws],
-        axis=0,
+    by_chance = np.array(  # (2, draws, M)
+        [[_silhouettes(draw(), numbers)[0].mean(axis=1) for _ in range(draws)] for draw in kinds]
     )
+    kind, number = by_chance.mean(axis=1).argmax(axis=0), np.arange(len(numbers))
+    mean = by_chance.mean(axis=1)[kind, number]
     agreement = []
-    for _ in range(SUBSAMPLES):
-        part = rng.choice(len(points), int(SHARE * len(points)), replace=False)
-        tree = linkage(points[part], "ward")
-        agreement.append(
-            [
-                adjusted_rand_score(whole[part], fcluster(tree, number, "maxclust"))
-                for number, whole in zip(numbers, groups, strict=True)
-            ]
-        )
-    return Support(numbers, (silhouettes - chance) / (1 - chance), np.mean(agreement, axis=0))
+    for _ in range(draws):
+        part = rng.choice(count, int(SHARE * count), replace=False)
+        parts = _cuts(linkage(points[part], "ward"), numbers)
+        agreement.append([adjusted_rand(whole[part], own) for whole, own in zip(groups, parts, strict=True)])
+    return Support(
+        numbers,
+        (silhouettes - mean[:, None]) / (1 - mean[:, None]),
+        by_chance.std(axis=1, ddof=1)[kind, number] / (1 - mean),
+        np.mean(agreement, axis=0),
+    )
 
 
-def _silhouettes(points: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def _cuts(tree: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """(M, N) groups 0, 1, … of a tree, for each number of groups."""
+    return np.stack([fcluster(tree, number, "maxclust") - 1 for number in numbers])
+
+
+def _silhouettes(points: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(M, N) silhouette of each point for ascending numbers of groups, and (M, N) its group."""
     condensed = pdist(points)
-    tree, distances = linkage(points, "ward"), squareform(condensed)
-    groups = [fcluster(tree, number, "maxclust") for number in numbers]
-    values = [
-        silhouette_score(distances, group, metric="precomputed") if len(np.unique(group)) > 1 else 0.0
-        for group in groups
-    ]
-    return np.array(values), groups
+    groups, distances = _cuts(linkage(condensed, "ward"), numbers), squareform(condensed)
+    rows, values = np.arange(len(points)), np.zeros(groups.shape)
+    sums, finer = distances, rows  # (N, groups): distances to all of a group together
+    for m in range(len(numbers))[::-1]:
+        group = groups[m]
+        count = int(group.max()) + 1
+        joined = np.zeros((sums.shape[1], count))  # which of the finer groups are one now
+        joined[finer, group] = 1.0
+        sums, finer, sizes = sums @ joined, group, np.bincount(group, minlength=count)
+        if count < 2:
+            continue
+        means = sums / sizes
+        means[rows, group] = np.inf
+        within, beside = sums[rows, group] / np.maximum(sizes[group] - 1, 1), means.min(axis=1)
+        larger = np.maximum(np.maximum(within, beside), 1e-300)
+        values[m] = np.where(sizes[group] > 1, (beside - within) / larger, 0.0)
+    return values, groups
+
+
+def adjusted_rand(first: np.ndarray, second: np.ndarray) -> float:
+    """Adjusted Rand index of (N,) groups 0, 1, …, without scikit-learn's checks, which take longer."""
+    width = int(second.max()) + 1
+    both = np.bincount(first * width + second, minlength=(int(first.max()) + 1) * width).reshape(-1, width)
+    together, one, other, all_pairs = (
+        float((n * (n - 1.0) / 2).sum())
+        for n in (both, both.sum(axis=1), both.sum(axis=0), np.array(len(first)))
+    )
+    expected, most = one * other / all_pairs, (one + other) / 2
+    return 1.0 if most == expected else (together - expected) / (most - expected)
 
 
 def split(points: np.ndarray, number: int) -> np.ndarray:

@@ -8,6 +8,9 @@ import numpy as np
 from lerobot_swr.discovery.clusters import (
     LEAST_SEPARATION,
     LEAST_STABILITY,
+    MOST_GROUPS,
+    WITHIN_SEPARATION,
+    WITHIN_STABILITY,
     groups_within,
     split,
     support,
@@ -26,7 +29,8 @@ from lerobot_swr.trajectories import Trajectories
 OUTLIER = "outlier"
 LEAST_EPISODES = 4  # of a dataset in which behaviours are looked for
 ROUNDS = 2  # the spread of everything is measured anew without the outliers
-SCENE_BONUS = 1.2  # without its scene an episode is compared by what a person chose
+CLEARLY = 1.5  # times the score without the scene from which on the scene is left in
+ROUNDING = 1.01  # of what is saved: known episodes are within reach, however far off the main directions
 REACH = 2.0  # a new episode belongs to a behaviour up to this many times the largest distance within it
 
 
@@ -44,6 +48,7 @@ class Discovery:
         reach: (K,) largest distance at which a new episode still belongs to a behaviour.
         separation: Silhouette of the behaviours, corrected for chance; 0 for one.
         stability: Agreement of clusterings of 80 % of the episodes; 1 for one.
+        supported: Whether the data show these groups; False for a given number of parts of one cloud.
         flat: (N, 2) places on a map.
         paths: What the episodes' paths look like.
     """
@@ -57,6 +62,7 @@ class Discovery:
     reach: np.ndarray
     separation: float
     stability: float
+    supported: bool
     flat: np.ndarray
     paths: Paths
 
@@ -136,6 +142,7 @@ class _View:
     score: float
     separation: float
     stability: float
+    supported: bool
 
 
 def _states(trajectories: Trajectories, source: Source) -> list[np.ndarray]:
@@ -161,32 +168,38 @@ def _manner(paths: Paths, states: Sequence[np.ndarray]) -> Manner | None:
 
 
 def _best_view(paths: Paths, kept: np.ndarray, number: int | None, rng: np.random.Generator) -> _View:
-    """With or without the scene: what shows clearer groups."""
-    members = np.flatnonzero(kept)
-    views = []
-    for without_scene in (True, False) if len(paths.scene) else (False,):
-        features, residuals = fit_features(paths, kept, without_scene)
-        places = residuals[members] @ features.directions.T
-        backing = support(places, rng, most=max(50, number or 0))
-        found, _ = backing.best(LEAST_SEPARATION, LEAST_STABILITY)
-        count = min(found if number is None else number, len(members))
-        place = np.flatnonzero(backing.numbers == count)
-        separation, stability = (
-            (float(backing.separation[place[0]]), float(backing.stability[place[0]]))
-            if len(place)
-            else (0.0, 1.0)
-        )
-        score = max(separation, 0.0) * stability * (SCENE_BONUS if without_scene else 1.0)
-        views.append(_View(features, residuals, members, split(places, count), score, separation, stability))
-    best = max(views, key=lambda view: view.score)
+    """Without the scene, or with it where that shows clearly better groups."""
+    best = _view(paths, kept, number, rng, len(paths.scene) > 0)
+    if len(paths.scene):
+        whole = _view(paths, kept, number, rng, without_scene=False)
+        clear = whole.separation >= WITHIN_SEPARATION and whole.stability >= WITHIN_STABILITY
+        if clear and whole.score > CLEARLY * best.score:
+            best = whole
     if number is not None or not best.groups.any():
         return best
 
     def main_places(rows: np.ndarray) -> np.ndarray:
-        own = best.residuals[members[rows]]
+        own = best.residuals[best.members[rows]]
         return (own - own.mean(axis=0)) @ main_directions(own).T
 
     return replace(best, groups=groups_within(best.groups, main_places, rng))
+
+
+def _view(
+    paths: Paths, kept: np.ndarray, number: int | None, rng: np.random.Generator, without_scene: bool
+) -> _View:
+    members = np.flatnonzero(kept)
+    features, residuals = fit_features(paths, kept, without_scene)
+    places = residuals[members] @ features.directions.T
+    backing = support(places, rng, most=max(MOST_GROUPS, number or 0))
+    found, _ = backing.best(LEAST_SEPARATION, LEAST_STABILITY)
+    count = min(number or found, len(members))
+    separation, stability, supported = 0.0, 1.0, count == 1
+    for place in np.flatnonzero(backing.numbers == count):
+        separation, stability = float(backing.separation[place]), float(backing.stability[place])
+        supported = bool(backing.supported(LEAST_SEPARATION, LEAST_STABILITY)[place])
+    score = max(separation, 0.0) * stability
+    return _View(features, residuals, members, split(places, count), score, separation, stability, supported)
 
 
 def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, least: int) -> Discovery:
@@ -217,7 +230,8 @@ def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, l
         middle = np.median(view.residuals[members], axis=0)
         medoids.append(int(members[np.linalg.norm(view.residuals[members] - middle, axis=1).argmin()]))
         within = nearest_distance(view.residuals[members], np.ones(len(members), bool))
-        reach.append(REACH * max(float(within.max()), usual))
+        off = np.linalg.norm(view.residuals[members] - places[members] @ view.features.directions, axis=1)
+        reach.append(max(REACH * max(float(within.max()), usual), ROUNDING * float(off.max())))
     return Discovery(
         view.features,
         groups,
@@ -228,6 +242,7 @@ def _named(view: _View, paths: Paths, manner: Manner | None, kept: np.ndarray, l
         np.array(reach),
         view.separation if len(behaviours) > 1 else 0.0,
         view.stability if len(behaviours) > 1 else 1.0,
+        view.supported or len(behaviours) == 1,
         _map(places, fits),
         paths,
     )

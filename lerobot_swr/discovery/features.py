@@ -12,8 +12,9 @@ from typing import Any, Self
 import numpy as np
 from sklearn.linear_model import RidgeCV
 
-from lerobot_swr.discovery.paths import walk, walk_all
+from lerobot_swr.discovery.paths import beginnings, walk, walk_all
 from lerobot_swr.discovery.sources import Episode, Source
+from lerobot_swr.scene_variation import robust_spread
 
 POINTS = 50
 MOVES = 0.02  # least spread within episodes of a dimension that counts as moving, relative to all frames'
@@ -69,18 +70,30 @@ class Paths:
         scaling: Their units.
         paths: (N, P, m) of the moving dimensions; P is 1 for vectors.
         firsts: (N, d) first states.
+        scene: Dimensions of the first state that differ between episodes as scenes do; none for vectors.
     """
 
     scaling: Scaling
     paths: np.ndarray
     firsts: np.ndarray
+    scene: np.ndarray
 
-    @property
-    def scene(self) -> np.ndarray:
-        """Dimensions of the first state that differ between episodes as scenes do."""
-        return (
-            np.flatnonzero(self.firsts.std(axis=0) > VARIES) if self.paths.shape[1] > 1 else np.array([], int)
-        )
+
+@dataclass(frozen=True)
+class Embedded:
+    """Where an episode lies.
+
+    Attributes:
+        place: (k,) along the main directions.
+        off: Distance from what these span.
+        path: (P·m,) its path.
+        usual: (P·m,) the mean path of its scene.
+    """
+
+    place: np.ndarray
+    off: float
+    path: np.ndarray
+    usual: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -103,19 +116,26 @@ class Features:
     offset: np.ndarray
     directions: np.ndarray
 
-    def residual(self, episode: Episode) -> np.ndarray:
-        """(P·m,) the path less the mean path of its scene."""
+    def embed(self, episode: Episode) -> Embedded:
+        """Where an episode lies."""
         states = self.scaling(self.scaling.source.states(episode))
         ways = self.scaling.ways(states)
-        path = ways[:1] if self.points == 1 else walk(ways, self.points)
-        terms = scene_terms(states[:1, self.scene], len(self.slope))
-        return path.reshape(-1) - self.offset - terms[0] @ self.slope
-
-    def embed(self, episode: Episode) -> tuple[np.ndarray, float]:
-        """(k,) place along the main directions, and the distance from what these span."""
-        residual = self.residual(episode)
+        path = (ways[:1] if self.points == 1 else walk(ways, self.points)).reshape(-1)
+        usual = self.offset + scene_terms(states[:1, self.scene], len(self.slope))[0] @ self.slope
+        residual = path - usual
         place = self.directions @ residual
-        return place, float(np.sqrt(max(residual @ residual - place @ place, 0.0)))
+        return Embedded(place, float(np.sqrt(max(residual @ residual - place @ place, 0.0))), path, usual)
+
+    def beside(self, new: Embedded, places: np.ndarray, share: float) -> np.ndarray:
+        """(N,) how far a new episode is from the first part, up to a share, of known ones in its scene.
+
+        Args:
+            new: The new episode.
+            places: (N, k) of the known ones.
+            share: Of their way.
+        """
+        known = (new.usual + places @ self.directions).reshape(len(places), self.points, -1)
+        return np.linalg.norm(beginnings(known, share).reshape(len(places), -1) - new.path, axis=1)
 
     def to_json(self) -> dict[str, Any]:
         """As ``behaviors.json`` holds it."""
@@ -185,7 +205,8 @@ def measure_paths(
     paths = np.stack(ways) if vectors else walk_all(ways, POINTS)
     firsts = np.stack([s[0] for s in scaled])
     firsts[:, constant] = 0.0
-    return Paths(scaling, paths, firsts)
+    varies = np.flatnonzero(robust_spread(firsts[kept]) > VARIES)
+    return Paths(scaling, paths, firsts, varies[:0] if vectors else varies)
 
 
 def _weights(moving: np.ndarray, widths: Sequence[int]) -> np.ndarray:

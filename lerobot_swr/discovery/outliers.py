@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from sklearn.neighbors import NearestNeighbors
 
+from lerobot_swr.discovery.paths import beginnings
+
 FAR = 5.0  # robust standard deviations of the logarithm
 FARTHER = 6.0  # the same, for numbers that vary for good reasons, too
 COPY = 0.02  # distance, relative to the size of what is compared, below which episodes count as copies
@@ -20,7 +22,8 @@ LEAST_FACTOR = 1.6  # and at least this many times the median
 SHORT, STILL = 0.35, 0.15  # shares of the median of frames, of the way covered
 LEAST_APART = 0.3  # of starts and ends that are far away, in units of a dimension's spread
 ROUGH = 5.0  # times the usual roughness that is called noise
-COVERED = 0.9  # a path that was cut off shows at most this share of the whole one
+COVERED = 0.2, 0.9  # a path that was cut off shows more and less than these shares of the whole one
+AS_NEAR = 2.0  # times the usual distance to the nearest path, up to which it follows another one
 DOUBTFUL = 2.0  # times the usual distance to the nearest path, from which on these are looked for
 CLOSER = 0.5  # a path fits so much better backwards, or as a part
 COMPARED = 500  # paths with which it is compared
@@ -129,6 +132,7 @@ def reasons(
     if not len(episodes):
         return {}
     others, distance = np.flatnonzero(kept), nearest_distance(residuals, kept)
+    apart = float(np.median(nearest_distance(paths.reshape(len(paths), -1), kept)[kept]))
     usual = float(np.median(distance[kept]))
     times = {i: f"{distance[i] / usual:.1f} times as far from the nearest episode as usual" for i in episodes}
     if manner is None or not usual:
@@ -148,24 +152,33 @@ def reasons(
         else:
             ends = [name for name, far in far_ends.items() if far[i]]
             where = f"; its {' and '.join(ends)} lies where no other's does" if ends else ""
-            told[i] = _spoiled_how(i, paths, others) or f"path far from any: {times[i]}{where}"
+            told[i] = _spoiled_how(i, paths, others, apart) or f"path far from any: {times[i]}{where}"
     return told
 
 
 def _spoiled(paths: np.ndarray, kept: np.ndarray) -> np.ndarray:
     """(N,) bool, the episodes rather far from others that are another one played backwards, or cut off."""
     distance = nearest_distance(paths.reshape(len(paths), -1), kept)
-    doubtful = np.flatnonzero(distance > DOUBTFUL * np.median(distance[kept]))
+    usual = float(np.median(distance[kept]))
+    doubtful = np.flatnonzero(distance > DOUBTFUL * usual)
     doubtful = doubtful[np.argsort(-distance[doubtful])][: max(20, len(paths) // 20)]
     others = np.flatnonzero(kept)
     result = np.zeros(len(paths), dtype=bool)
     for i in doubtful:
-        result[i] = _spoiled_how(int(i), paths, others) is not None
+        result[i] = _spoiled_how(int(i), paths, others, usual) is not None
     return result
 
 
-def _spoiled_how(episode: int, paths: np.ndarray, others: np.ndarray) -> str | None:
-    """Whether an episode is another one played backwards, or cut off, in words; None if it is neither."""
+def _spoiled_how(episode: int, paths: np.ndarray, others: np.ndarray, usual: float) -> str | None:
+    """Whether an episode is another one played backwards, or cut off, in words; None if it is neither.
+
+    Args:
+        episode: Its number.
+        paths: (N, P, m).
+        others: Numbers of those with which it is compared.
+        usual: Distance of a path (P·m,) to the nearest other one.
+    """
+    near = AS_NEAR * max(usual / len(paths[0]) ** 0.5, COPY * _size(paths[others]))
     others = others[others != episode]
     if len(others) > COMPARED:
         others = others[np.linspace(0, len(others) - 1, COMPARED).astype(int)]
@@ -174,9 +187,14 @@ def _spoiled_how(episode: int, paths: np.ndarray, others: np.ndarray) -> str | N
     part, share = _as_part(own, whole)
     if backward < CLOSER * forward and backward < part:
         return "reversed: played backwards it follows another episode"
-    if part < CLOSER * forward and share < COVERED:
+    if part < min(CLOSER * forward, near) and COVERED[0] < share < COVERED[1]:
         return f"cut off: follows another episode for {share:.0%} of its way and ends there"
     return None
+
+
+def _size(paths: np.ndarray) -> float:
+    """Root mean square distance of paths (M, P, m) to their mean."""
+    return float(np.sqrt(np.square(paths - paths.mean(axis=0)).sum(axis=2).mean()))
 
 
 def _apart(path: np.ndarray, others: np.ndarray) -> np.ndarray:
@@ -186,14 +204,9 @@ def _apart(path: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 def _as_part(path: np.ndarray, others: np.ndarray) -> tuple[float, float]:
     """The least distance of a path to a beginning of one of the others, and what share of it this is."""
-    points = len(path)
     best, best_share = np.inf, 1.0
     for share in np.linspace(0.2, 1.0, 17):
-        at = np.linspace(0, share * (points - 1), points)
-        left = np.minimum(at.astype(int), points - 2)
-        weight = (at - left)[None, :, None]
-        begun = others[:, left] * (1 - weight) + others[:, left + 1] * weight
-        apart = float(_apart(path, begun).min())
+        apart = float(_apart(path, beginnings(others, share)).min())
         if apart < best:
             best, best_share = apart, float(share)
     return best, best_share

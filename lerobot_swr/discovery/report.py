@@ -77,6 +77,7 @@ def write_report(
         "paths": {i: np.round(flat[i], 4).tolist() for i in sorted(drawn)},
         "map": [[int(i), int(found.groups[i]), *np.round(found.flat[i], 4).tolist()] for i in mapped],
         "compared": compared_by(found),
+        "no_groups": no_groups(found),
         "separation": found.separation,
         "stability": found.stability,
     }
@@ -130,5 +131,16 @@ def compared_by(found: Discovery) -> str:
     what = f"the function {source.function}" if source.function else ", ".join(source.keys)
     if found.features.points == 1:
         return what
-    scene = ", less what the scene at the start explains" if len(found.features.scene) else ""
+    scene = ""
+    if len(found.features.scene):
+        scene = ", less what the scene at the start explains"
+    elif len(found.paths.scene):
+        scene = ", the scene at the start included, since that shows clearly better groups"
     return f"the path of {what}, at an even pace{scene}"
+
+
+def no_groups(found: Discovery) -> str:
+    """A sentence where the behaviours that were asked for are no groups in the data; else nothing."""
+    if found.supported:
+        return ""
+    return f"The data show no {len(found.names)} groups: these behaviours are parts of one cloud."

@@ -1,7 +1,8 @@
 """``behaviors.json``: what was found, as a file and as a behaviour rule.
 
 A new episode gets the behaviour of the nearest known episode; one that is farther from it than `reach`
-allows, or whose nearest is an outlier, is an outlier.
+allows, or whose nearest is an outlier, is an outlier. A rollout may end when its task is done, a little
+earlier than the demonstrations: then it is compared with their ways up to there.
 """
 
 import json
@@ -18,6 +19,8 @@ from lerobot_swr.whole_files import write_whole
 
 RULE_FILE = "behaviors.json"
 VERSION = 1
+EARLY = (0.95, 0.9, 0.85)  # shares of a known episode's way after which a new one may end
+COMPARED = 200  # known episodes, the nearest, with which one that ends early is compared
 
 
 @dataclass(frozen=True)
@@ -44,15 +47,20 @@ class DiscoveredRule:
         Raises:
             ValueError: If the episode lacks what the behaviours were found by.
         """
-        place, beside = self.features.embed(observations)
-        distances = np.linalg.norm(self.places - place, axis=1)
+        new = self.features.embed(observations)
+        distances = np.linalg.norm(self.places - new.place, axis=1)
         nearest = int(distances.argmin())
         group = int(self.groups[nearest])
-        if group < 0:
+        far = float(np.hypot(distances[nearest], new.off)) > self.reach[group]
+        if group < 0 or (far and self.features.points == 1):
             return OUTLIER
-        # The known episodes, too, lie a little beside what the main directions span; theirs is not counted.
-        far = float(np.hypot(distances[nearest], beside)) > self.reach[group] and distances[nearest] > 1e-3
-        return OUTLIER if far else self.names[group]
+        if not far:
+            return self.names[group]
+        some = np.argsort(distances)[:COMPARED]
+        some = some[self.groups[some] >= 0]
+        early = np.array([self.features.beside(new, self.places[some], share) for share in EARLY])
+        group = int(self.groups[some[early.min(axis=0).argmin()]])
+        return self.names[group] if early.min() <= self.reach[group] else OUTLIER
 
     @classmethod
     def load(cls, path: Path) -> Self:
