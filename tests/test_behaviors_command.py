@@ -155,6 +155,24 @@ def test_results_do_not_replace_the_rule(run_command, folder: Path, maze: Path, 
     assert (folder / "behaviors.json").read_bytes() == before
 
 
+def test_behaviours_of_one_name_are_one_row(maze: Path, tmp_path: Path, run_command, capsys):
+    """Equal names are counted together; parts of one cloud are told, and what was compared."""
+    run_command(
+        behaviors.main,
+        f"--dataset.root={maze}",
+        f"--output_dir={tmp_path}",
+        "--num_behaviors=3",
+        "--names=[a, a, b]",
+        "--frames=0",
+    )
+    printed = capsys.readouterr().out
+    assert "2 behaviours in 20 episodes" in printed
+    assert "Compared by the path of observation.state, at an even pace" in printed
+    rows = [line.split()[:2] for line in printed.splitlines() if re.match(r"  [ab] ", line)]
+    assert [name for name, _ in rows] == ["a", "b"]
+    assert sum(int(count) for _, count in rows) == 20
+
+
 def test_labels_of_other_rules_are_no_checkpoints():
     """What a maze expects of a start leaves names that are not its own alone."""
     task = Maze2DEnvConfig(task="medium")

@@ -25,7 +25,7 @@ from lerobot_swr.dataset_checks import edit_command
 from lerobot_swr.dataset_files import is_numeric
 from lerobot_swr.discovery.discover import OUTLIER, Discovery, discover, named
 from lerobot_swr.discovery.frames import strips
-from lerobot_swr.discovery.report import REPORT_FILE, write_report
+from lerobot_swr.discovery.report import REPORT_FILE, compared_by, no_groups, write_report
 from lerobot_swr.discovery.rule import RULE_FILE, rule_data, write_rule
 from lerobot_swr.discovery.sources import Source
 from lerobot_swr.evaluation.checkpoint import DatasetSource
@@ -158,18 +158,17 @@ def _dimension_names(meta: LeRobotDatasetMetadata, source: Source) -> list[str]:
 
 
 def format_discovery(found: Discovery, trajectories: Trajectories) -> str:
-    """A table for the terminal."""
-    count = len(found.names)
-    head = f"{count} behaviour{'s' if count != 1 else ''} in {len(trajectories)} episodes"
+    """A table for the terminal; behaviours of the same name are one row."""
+    names, labels = list(dict.fromkeys(found.names)), np.array(found.labels)
+    head = f"{len(names)} behaviour{'s' if len(names) != 1 else ''} in {len(trajectories)} episodes"
     lines = [f"{head} (separation {found.separation:.2f}, stability {found.stability:.2f})"]
+    lines += [line for line in (no_groups(found), f"Compared by {compared_by(found)}.") if line]
     lines.append(f"  {'behaviour':<24} {'episodes':>8} {'share':>6}  typical  frames")
-    for k, name in enumerate(found.names):
-        members = np.flatnonzero(found.groups == k)
+    for name in names:
+        members = np.flatnonzero(labels == name)
         low, middle, high = np.quantile(trajectories.lengths[members], [0, 0.5, 1]).astype(int)
-        share = len(members) / len(trajectories)
-        lines.append(
-            f"  {name:<24} {len(members):8d} {share:6.1%}  {found.medoids[k]:7d}  {middle} ({low} to {high})"
-        )
+        share, typical = len(members) / len(trajectories), found.medoids[found.names.index(name)]
+        lines.append(f"  {name:<24} {len(members):8d} {share:6.1%}  {typical:7d}  {middle} ({low} to {high})")
     if found.reasons:
         lines.append(f"  {OUTLIER}s: {len(found.reasons)}")
         lines += [f"    episode {episode}: {why}" for episode, why in found.reasons.items()]
