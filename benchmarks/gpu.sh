@@ -4,8 +4,8 @@
 #   benchmarks/gpu.sh DATASET [OUTPUT]          DATASET: PushT's human demonstrations as a LeRobotDataset v3
 #   TINY=1 DEVICE=cpu benchmarks/gpu.sh ...     the same with tiny networks and a few steps, without a GPU
 #
-# It checks that CPU and GPU agree on a batch, trains zbc over act and over diffusion (the recipes
-# configs/zbc_act_pusht.yaml and wzbc_diffusion_pusht.yaml, bf16) and the plain policies beside them, prints
+# It checks that CPU and GPU agree on a batch, trains the recipes configs/zbc_act_pusht.yaml and
+# configs/wzbc_diffusion_pusht.yaml (bf16) and the plain policies with the same options beside them, prints
 # their steps per second, and rolls PushT out with each style policy. Every part has its time limit.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -25,31 +25,23 @@ if [ -n "${TINY:-}" ]; then
     SMALL_diffusion="down_dims=[16,32] n_groups=4 num_train_timesteps=10 num_inference_steps=2"
 fi
 
-flags() { # flags of a policy: its options with a prefix
-    local kind=$1 prefix=$2 small
-    echo "--$prefix.type=$kind"
-    case $kind in
-        act) set -- chunk_size=20 n_action_steps=8 use_vae=false pretrained_backbone_weights=null \
-            optimizer_lr=0.0001 optimizer_lr_backbone=0.0001 ;;
-        diffusion) set -- horizon=16 n_action_steps=8 'crop_shape=[84,84]' use_group_norm=true \
-            pretrained_backbone_weights=null prediction_type=sample noise_scheduler_type=DDIM \
-            num_inference_steps=10 ;;
-    esac
-    small="SMALL_$kind"
-    for option in "$@" ${!small}; do echo "--$prefix.$option"; done
+plain() { # flags of the policy without styles that has a recipe's options
+    "$PYTHON" - "$1" <<'PYTHON'
+import json, sys
+import yaml
+policy = yaml.safe_load(open(sys.argv[1]))["policy"]
+for key, value in {**policy["backbone"], **{k: policy[k] for k in ("use_amp", "input_features")}}.items():
+    print(f"--policy.{key}={value if isinstance(value, str) else json.dumps(value)}")
+PYTHON
 }
 
-train() { # name kind styled?
-    local name=$1 kind=$2 styled=$3 policy
-    if [ "$styled" = yes ]; then
-        mapfile -t policy < <(echo --policy.type=zbc; flags "$kind" policy.backbone)
-    else
-        mapfile -t policy < <(flags "$kind" policy)
-    fi
+train() { # name kind prefix-of-the-network's-options flags...
+    local name=$1 kind=$2 prefix=$3 small="SMALL_$2" tiny=()
+    shift 3
+    for option in ${!small}; do tiny+=("--$prefix.$option"); done
     # A step after the time limit ends the run; the checkpoint is the last one before.
-    timeout --signal=INT "$TRAIN_S" "$BIN/lerobot-train" "${policy[@]}" \
-        --policy.device="$DEVICE" --policy.use_amp=true --policy.push_to_hub=false \
-        --policy.input_features='{"observation.state": {"type": "STATE", "shape": [2]}, "observation.image": {"type": "VISUAL", "shape": [3, 96, 96]}}' \
+    timeout --signal=INT "$TRAIN_S" "$BIN/lerobot-train" "$@" "${tiny[@]}" \
+        --policy.device="$DEVICE" --policy.push_to_hub=false \
         --dataset.repo_id=local/pusht --dataset.root="$DATASET" --dataset.video_backend=pyav \
         --batch_size="${BATCH:-64}" --num_workers="${WORKERS:-8}" --steps="$STEPS" --save_freq="${SAVE:-200}" \
         --log_freq="$LOG" --seed=1000 --output_dir="$OUTPUT/$name" > "$OUTPUT/$name.log" 2>&1 || true
@@ -78,9 +70,12 @@ evaluate() { # name
 
 mkdir -p "$OUTPUT"
 "$PYTHON" -m benchmarks.device_agreement --dataset="$DATASET" --device="$DEVICE" ${TINY:+--tiny}
-for kind in act diffusion; do
-    train "$kind" "$kind" no
-    train "zbc_$kind" "$kind" yes
+for styled in zbc_act wzbc_diffusion; do
+    kind=${styled#*_}
+    recipe=configs/${styled}_pusht.yaml
+    mapfile -t options < <(plain "$recipe")
+    train "$kind" "$kind" policy "${options[@]}"
+    train "$styled" "$kind" policy.backbone --config_path="$recipe" --policy.backbone.type="$kind"
 done
 evaluate zbc_act
-evaluate zbc_diffusion
+evaluate wzbc_diffusion

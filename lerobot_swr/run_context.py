@@ -5,20 +5,26 @@ LeRobot creates a policy with the metadata of the whole dataset and nothing else
 file, here and nowhere else, unless a program says it with `running`.
 """
 
+import logging
 import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import yaml
 from lerobot.configs import parser
 from lerobot.configs.default import DatasetConfig
 from lerobot.configs.train import TRAIN_CONFIG_NAME, TrainPipelineConfig
 from lerobot.datasets import LeRobotDatasetMetadata
+
+DROP = "drop_n_last_frames"  # what LeRobot's policies call it
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,6 +57,34 @@ class RunContext:
         episodes, eval_split, resume = options.values()
         return cls(_episodes(meta, episodes, eval_split), bool(resume))
 
+    def without_short(self, lengths: np.ndarray, unseen: int, name: str) -> Self:
+        """The run without episodes of which LeRobot's sampler shows no frame.
+
+        Args:
+            lengths: (N,) frames of all episodes.
+            unseen: How many the policy leaves out at each episode's end (its `DROP`).
+            name: Of the dataset.
+
+        Raises:
+            ValueError: If none is left.
+        """
+        short = [episode for episode in self.episodes if lengths[episode] <= unseen]
+        if not short:
+            return self
+        if len(short) == len(self.episodes):
+            raise ValueError(
+                f"{name}: no episode has more than {unseen} frames, which the policy leaves out at the end "
+                f"of each: give {DROP}=0 (--policy.backbone.{DROP}=0)"
+            )
+        logger.warning(
+            "episodes %s have no more than %d frames, which the policy leaves out at the end of each (%s): "
+            "they are not trained on and get no style",
+            short,
+            unseen,
+            DROP,
+        )
+        return replace(self, episodes=tuple(sorted(set(self.episodes) - set(short))))
+
 
 _told: ContextVar[tuple[DatasetConfig, bool] | None] = ContextVar("running", default=None)
 
@@ -80,6 +114,15 @@ def dataset_of_command() -> tuple[str | None, str | None, str | None]:
     if root is not None or file is None or not Path(file).exists():
         return root, repo_id, None
     return (_content(file).get("dataset") or {}).get("root"), repo_id, file
+
+
+def given_below(name: str, files: bool = True) -> set[str]:
+    """Fields below a dotted name that the command line gives or, if `files`, its configuration file."""
+    prefix = f"--{name}."
+    flags = {word[len(prefix) :].partition("=")[0] for word in sys.argv[1:] if word.startswith(prefix)}
+    file = parser.parse_arg("config_path")
+    filed = _entry(_content(file), name) if files and file is not None else None
+    return {flag.partition(".")[0] for flag in flags} | set(filed or {})
 
 
 def _episodes(

@@ -82,6 +82,11 @@ class Trajectories:
         columns = {key: column[~left_out] for key, column in self.columns.items()}
         return replace(self, lengths=lengths, columns=columns, index=None)
 
+    def ends(self, count: int) -> np.ndarray:
+        """(F,) bool, which frames are among the last `count` of their episode."""
+        place = np.arange(self.lengths.sum()) - np.repeat(self.starts, self.lengths)
+        return place >= np.repeat(self.lengths - count, self.lengths)
+
     def followed_by(self, other: "Trajectories", keys: Sequence[str]) -> "Trajectories":
         """The features `keys` of these episodes and of others after them."""
         columns = {key: np.concatenate([self.columns[key], other.columns[key]]) for key in keys}

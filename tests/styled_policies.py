@@ -48,6 +48,10 @@ TINY: dict[str, dict[str, Any]] = {
         "spatial_softmax_num_keypoints": 4,
     },
     "toy": {},
+    "tdmpc": {"horizon": 2},
+    "beso": {"dim_model": 16, "n_layers": 1, "n_heads": 2},
+    "ddpm_gpt": {"dim_model": 16, "n_layers": 1, "n_heads": 2},
+    "ddpm_act": {"dim_model": 16, "n_heads": 2},
     "smolvla": {
         "chunk_size": 4,
         "n_action_steps": 2,

@@ -9,6 +9,7 @@ import pytest
 import torch
 from conftest import train_flags
 from lerobot.configs import PreTrainedConfig
+from lerobot.policies.factory import make_policy_config
 from lerobot.scripts import lerobot_eval
 from safetensors.torch import load_file
 from styled_policies import LENGTHS, batch_of, checkpoint, load, metadata_of, nested
@@ -104,6 +105,19 @@ def test_held_out_episodes_are_scored_under_an_encoded_style(make_styled, small_
     assert loss < min(borrowed) + 1e-3
     assert torch.equal(torch.get_rng_state(), state)
     assert policy.styles.trained.tolist() == [1, 1, 1, 1, 0, 0]
+
+
+def test_flags_stand_above_a_plain_checkpoint(make_styled, small_maze, tmp_path, monkeypatch):
+    """Those that say what is the default anyway, too; a checkpoint with styles begins from no plain one."""
+    act = PreTrainedConfig.get_choice_class("act")
+    act(device="cpu", chunk_size=4, n_action_steps=2).save_pretrained(tmp_path)
+    flags = ["--policy.backbone.chunk_size=100", f"--policy.backbone.pretrained_path={tmp_path}"]
+    monkeypatch.setattr("sys.argv", ["lerobot-train", *flags])
+    backbone = act(device="cpu", pretrained_path=tmp_path)
+    config = make_policy_config("zbc", backbone=backbone, device="cpu")
+    assert (config.backbone.chunk_size, config.backbone.n_action_steps) == (100, 2)
+    with pytest.raises(ValueError, match=r"the weights come from the checkpoint at policy\.path"):
+        make_policy_config("zbc", backbone=backbone, device="cpu", num_episodes=3)
 
 
 @pytest.mark.parametrize("kind", ["act", "diffusion"])

@@ -27,6 +27,6 @@ def test_every_part_of_the_script_runs(tmp_path):
         text=True,
     )
     assert run.returncode == 0, run.stdout + run.stderr
-    for part in ("chunk: relative difference", "zbc_act on PushT:", "zbc_diffusion on PushT:"):
+    for part in ("chunk: relative difference", "zbc_act on PushT:", "wzbc_diffusion on PushT:"):
         assert part in run.stdout
     assert run.stdout.count("steps/s with loading") == 4

@@ -45,7 +45,9 @@ def test_frames_that_weigh_alike_are_left_alone():
 def test_lists_follow_and_what_is_no_frame_stays():
     """Tasks are those of the rows that are shown."""
     batch = {"loss": torch.arange(3.0), "task": ["a", "b", "c"], "fps": 10, "scale": torch.tensor(2.0)}
+    batch["mean"] = torch.zeros(2)
     shown, factor = redrawn(batch, torch.tensor([0.0, 0.0, 1.5]), 0.9)
     assert shown["loss"].tolist() == [2.0, 2.0, 2.0]
     assert shown["task"] == ["c", "c", "c"]
     assert (shown["fps"], shown["scale"], factor) == (10, batch["scale"], 0.5)
+    assert shown["mean"] is batch["mean"]

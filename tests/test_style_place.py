@@ -5,14 +5,17 @@ import torch
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.policies.factory import make_policy_config
 
-from lerobot_swr.policies.backbones.registry import BackboneConfig
+from lerobot_swr.policies.backbones.registry import BackboneConfig, WithoutOptions
 from lerobot_swr.policies.backbones.style_place import StylePlace
 
 TEXT = ["pi05", "pi0_fast", "groot", "molmoact2"]
 
 
-def test_every_registered_policy_is_offered_but_style_policies():
+def test_every_registered_policy_is_offered_but_style_policies(monkeypatch):
     """LeRobot's own, our baselines and what plugins register later."""
+    known = BackboneConfig.get_known_choices()
+    assert known["act"] is WithoutOptions  # nobody has asked for its options
+    monkeypatch.setattr("sys.argv", ["lerobot-train", "--policy.backbone.chunk_size=4"])
     known = BackboneConfig.get_known_choices()
     assert {"mlp", "act", "diffusion", "smolvla", "beso", "toy"} <= set(known)
     assert not {"bc", "zbc", "wzbc"} & set(known)
@@ -23,6 +26,23 @@ def test_every_registered_policy_is_offered_but_style_policies():
         assert BackboneConfig.get_choice_name(late) == "late"
     finally:
         del PreTrainedConfig._choice_registry["late"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "offered"),
+    [
+        (["--policy.type=zbc"], set()),
+        (["--policy.backbone.type=act", "--policy.backbone.chunk_size=4"], {"act"}),
+        (["--policy.backbone.type", "act"], {"act"}),
+        (["--policy.path=a", "--policy.backbone.chunk_size=4"], {"act", "diffusion", "smolvla"}),
+    ],
+)
+def test_flags_are_offered_of_what_the_command_line_is_about(monkeypatch, flags, offered):
+    """To make those of all policies takes seconds."""
+    monkeypatch.setattr("sys.argv", ["lerobot-train", *flags])
+    known = BackboneConfig.get_known_choices()
+    found = {name for name in ("act", "diffusion", "smolvla") if known[name] is not WithoutOptions}
+    assert found == offered
 
 
 def test_a_style_extends_an_observation_or_is_one():
@@ -59,6 +79,12 @@ def test_policies_that_turn_the_state_into_text_are_refused_before_they_are_made
         make_policy_config("zbc", backbone=backbone, device="cpu")
     assert "\n" not in str(told.value)
     make_policy_config("bc", backbone=backbone, device="cpu")
+
+
+def test_a_policy_that_cannot_be_made_at_all_is_told_as_that(make_styled, small_maze):
+    """Not as one that cannot take a style."""
+    with pytest.raises(ValueError, match=r"type='toy' cannot be made: RuntimeError: no room"):
+        make_styled("zbc", "toy", small_maze, backbone={"reads": "raises"})
 
 
 @pytest.mark.parametrize("reads", ["nothing", "rounded"])

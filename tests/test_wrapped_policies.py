@@ -5,11 +5,13 @@ import json
 from types import SimpleNamespace
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 import torch
 from lerobot.configs import PreTrainedConfig
 from lerobot.policies import make_pre_post_processors, pretrained
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, DONE, REWARD
+from odd_datasets import PLAIN, arcs, feature, write
 from styled_policies import KINDS, batch_of, metadata_of, observed
 
 from lerobot_swr.policies.backbones.wrapped_policy import WrappedPolicy
@@ -190,6 +192,65 @@ def test_histories_take_on_a_new_style(make_styled, small_maze):
     z = policy.styles.embedding.weight[2:3]
     assert all(torch.equal(remembered[:, -policy.config.style_dim :], z) for remembered in history)
     assert len(history) == 2
+
+
+def test_a_chunk_that_is_asked_for_takes_the_new_style_throughout(make_styled, small_maze):
+    """Its history, too, as LeRobot's asynchronous and real-time inference ask for chunks."""
+    policy = make_styled("zbc", "diffusion", small_maze).eval()
+    policy.reset()
+    policy.styles.request([1])
+    policy.select_action(observed(policy, small_maze, size=1))
+    policy.styles.request([2])
+    policy.predict_action_chunk(observed(policy, small_maze, size=1, row=1))
+    history = policy.backbone.policy._queues["observation.environment_state"]
+    z = policy.styles.embedding.weight[2:3]
+    assert all(torch.equal(remembered[:, -policy.config.style_dim :], z) for remembered in history)
+
+
+@pytest.mark.parametrize("kind", ["beso", "ddpm_gpt", "ddpm_act", "tdmpc"])
+def test_policies_that_look_at_their_dataset_or_at_rewards_take_styles(make_styled, rewarded_arcs, kind):
+    """This package's baselines, and a policy that learns values."""
+    policy = make_styled("zbc", kind, rewarded_arcs).train()
+    policy.forward(batch_of(policy, rewarded_arcs))[0].backward()
+    assert policy.styles.embedding.weight.grad.abs().sum() > 0
+
+
+@pytest.fixture(scope="module")
+def rewarded_arcs(tmp_path_factory):
+    """Folder of a dataset with rewards."""
+
+    def frame(i, t, n):
+        return {**arcs(i, t, n), REWARD: np.array([t / n], np.float32), DONE: np.array([t == n - 1])}
+
+    features = {**PLAIN, REWARD: feature(1), DONE: feature(1, dtype="bool")}
+    return write(tmp_path_factory.mktemp("rewarded") / "arcs", features, frame)
+
+
+def test_episodes_that_the_sampler_never_shows_get_no_style(make_styled, tmp_path, caplog):
+    """The others count alike over the frames that it shows."""
+    root = write(tmp_path / "short", lengths=(2, 3, 4, 8))
+    policy = make_styled("zbc", "toy", root)
+    assert policy.config.drop_n_last_frames == 3
+    assert policy.styles.trained.tolist() == [0, 0, 1, 1]
+    assert "episodes [0, 1] have no more than 3 frames" in caplog.text
+    assert (policy.balance.factors[2:] * torch.tensor([1, 5])).tolist() == [3, 3]
+    with pytest.raises(ValueError, match=r"no episode has more than 3 frames.* drop_n_last_frames=0"):
+        make_styled("zbc", "toy", root, episodes=[0, 1])
+
+
+def test_similarity_may_compare_what_the_network_does_not_see(make_styled, tmp_path):
+    """Any column of numbers of the dataset, the simulator's state beside the cameras, for one."""
+
+    def frame(i, t, n):
+        return {**arcs(i, t, n), "simulator.state": np.array([i % 2], np.float32)}
+
+    root = write(tmp_path / "arcs", {**PLAIN, "simulator.state": feature(1)}, frame)
+    policy = make_styled("wzbc", "toy", root, similarity_keys=["simulator.state"])
+    assert "simulator.state" not in policy.config.input_features
+    neighbours = policy.styles.table.neighbours[:, 0] % 2
+    assert neighbours.tolist() == [0, 1, 0, 1]
+    with pytest.raises(ValueError, match=r"simulator\.nothing are no numbers of .* simulator\.state"):
+        make_styled("wzbc", "toy", root, similarity_keys=["simulator.nothing"])
 
 
 def test_a_rollout_with_more_environments_needs_a_reset(make_styled, small_maze):

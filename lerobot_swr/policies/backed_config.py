@@ -15,6 +15,7 @@ from lerobot_swr.policies.backbones.registry import BackboneConfig
 from lerobot_swr.policies.backbones.traits import Traits
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.policies.vector_pipelines import Pipelines
+from lerobot_swr.run_context import DROP
 from lerobot_swr.similarity import Manner
 
 
@@ -121,6 +122,11 @@ class BackedConfig(StateConfig):
         return self.traits.sees_images
 
     @property
+    def unseen_frames(self) -> int:
+        """How many frames at the end of every episode LeRobot's sampler leaves out."""
+        return int(getattr(self, DROP, 0) or 0)
+
+    @property
     def observation_delta_indices(self) -> list[int] | None:
         """Steps of the observations in a batch, as the backbone wants them."""
         return self.traits.observation_delta_indices
@@ -151,6 +157,11 @@ class BackedConfig(StateConfig):
     def compared_keys(self) -> list[str]:
         """The features over which ν compares demonstrations; pictures are none."""
         return self.observation_keys
+
+    @property
+    def recorded_keys(self) -> list[str]:
+        """The features of numbers that are read of demonstrations: inputs, action, and what ν compares."""
+        return list(dict.fromkeys([*self.dimensions, *self.compared_keys]))
 
     @property
     def manner(self) -> Manner:

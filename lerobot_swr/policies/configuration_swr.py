@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from lerobot.configs import PreTrainedConfig
-from lerobot.utils.constants import ACTION
 
 from lerobot_swr.configuration import tells_bad_values
 from lerobot_swr.policies.backbones.style_place import AUTO, check_style_place
@@ -56,8 +55,8 @@ class ZBCConfig(BCConfig):
     style_key: str = AUTO
 
     # --- Similarity of demonstrations ---
-    # Features, in their own units, over which demonstrations are compared; null takes all observations that
-    # the network sees.
+    # Features of numbers, in their own units, over which demonstrations are compared; null takes all
+    # observations that the network sees. Any column of the dataset will do, seen by the network or not.
     similarity_keys: list[str] | None = None
     # Compare the hand's path in the frame of this object instead (and the similarity_keys that are named).
     similarity_frame: str | None = None
@@ -185,25 +184,12 @@ class ZBCConfig(BCConfig):
 
     @property
     def compared_keys(self) -> list[str]:
-        """The features over which ν compares demonstrations.
-
-        Raises:
-            ValueError: If a configured feature is unknown.
-        """
-        keys = self.similarity_keys or self.observation_keys
-        known = [*self.observation_keys, ACTION]
-        unknown = [key for key in keys if key not in known]
-        if unknown:
-            raise ValueError(f"similarity_keys={keys}: {unknown} are not among {known}")
-        return keys
+        """The features over which ν compares demonstrations."""
+        return self.similarity_keys or self.observation_keys
 
     @property
     def manner(self) -> Manner:
-        """What of demonstrations ν compares.
-
-        Raises:
-            ValueError: If a configured feature is unknown.
-        """
+        """What of demonstrations ν compares."""
         is_plain = self.similarity_frame is None and self.similarity_features is None
         keys = self.compared_keys if is_plain or self.similarity_keys else []
         names = self.dimension_names or {}

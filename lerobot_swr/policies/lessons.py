@@ -85,10 +85,11 @@ class Balance:
         episodes: Those that are trained on, over which all means are.
         pauses: (F,) bool, frames that are left out; None for none.
         episodes_alike: Whether episodes count alike, rather than frames.
+        unseen: How many frames at each episode's end the sampler never shows.
 
     Attributes:
         factors: (N,) factor of the loss of each episode's frames that are no pauses: mean length / length,
-            pauses not counted; or 1.
+            pauses and what is never shown not counted; or 1.
     """
 
     def __init__(
@@ -97,16 +98,18 @@ class Balance:
         episodes: Sequence[int],
         pauses: np.ndarray | None,
         episodes_alike: bool,
+        unseen: int = 0,
     ):
-        moving = trajectories if pauses is None else trajectories.without(pauses)
-        lengths = torch.from_numpy(moving.lengths).to(torch.float32)
-        chosen = torch.tensor(episodes)
+        moves = np.ones(trajectories.lengths.sum(), bool) if pauses is None else ~pauses
+        counted = moves & ~trajectories.ends(unseen) if unseen else moves
+        counts = torch.from_numpy(np.add.reduceat(counted, trajectories.starts, dtype=np.int64))
+        lengths, chosen = counts.clamp(min=1).to(torch.float32), torch.tensor(episodes)
         self.factors = lengths[chosen].mean() / lengths if episodes_alike else torch.ones(len(lengths))
         self._of_frames: Tensor | None = None  # (F,) 0 in a pause, their mean over the episodes' frames is 1
         if pauses is not None:
-            share = lengths[chosen].sum() / trajectories.lengths[list(episodes)].sum()
-            moves = torch.from_numpy(~pauses).to(torch.float32)
-            self._of_frames, self._rows = moves / share, FrameRows(trajectories)
+            shown = (trajectories.lengths[list(episodes)] - unseen).clip(min=0)
+            share = counts[chosen].sum() / shown.sum()
+            self._of_frames, self._rows = torch.from_numpy(moves) / share, FrameRows(trajectories)
 
     def __call__(self, lesson: Lesson, steps: int) -> Lesson:
         """Weight the frames."""

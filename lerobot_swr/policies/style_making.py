@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from lerobot_swr.policies.configuration_swr import WZBCConfig, ZBCConfig
+from lerobot_swr.policies.configuration_swr import BCConfig, WZBCConfig, ZBCConfig
+from lerobot_swr.policies.lessons import Balance
 from lerobot_swr.policies.training_data import TrainingData
 from lerobot_swr.sampling import PartnerSampler, check_partner_sampling
 from lerobot_swr.similarity import check_normalization
@@ -10,6 +11,12 @@ from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.styles.embedding import MannerEmbedding
 from lerobot_swr.styles.table import StyleTable, make_nearest_table
+
+
+def make_balance(config: BCConfig, data: TrainingData) -> Balance:
+    """Lets all episodes that are trained on count alike, as far as LeRobot's sampler shows them."""
+    episodes, alike = data.run.episodes, config.balance_episodes
+    return Balance(data.trajectories, episodes, data.pauses, alike, config.unseen_frames)
 
 
 def make_cookbook(config: ZBCConfig, data: TrainingData | None) -> StyleCookbook:

@@ -17,7 +17,7 @@ from lerobot_swr.policies.loss_errors import LossErrors
 from lerobot_swr.policies.row_adam import FROM_ROWS
 from lerobot_swr.policies.scene_defaults import adopt_scene_defaults
 from lerobot_swr.policies.stored_styles import StoredStyles
-from lerobot_swr.policies.style_making import make_cookbook, make_sampler
+from lerobot_swr.policies.style_making import make_balance, make_cookbook, make_sampler
 from lerobot_swr.policies.training_data import TrainingData, adopt_features, adopt_names
 from lerobot_swr.styles.cookbook import StyleCookbook
 from lerobot_swr.styles.encoding import ActionErrors, Imitation
@@ -67,7 +67,7 @@ class StylePolicy(StoredStyles, PreTrainedPolicy):
         if dataset_meta is not None:
             adopt_names(config, dataset_meta)
             self.data = data = TrainingData.read(config, dataset_meta)
-            self.balance = Balance(data.trajectories, data.run.episodes, data.pauses, config.balance_episodes)
+            self.balance = make_balance(config, data)
             if isinstance(config, ZBCConfig):
                 adopt_scene_defaults(config, data.scene_variation)
             config.traits.adopt(config, data.trajectories.columns, data.trajectories.lengths)

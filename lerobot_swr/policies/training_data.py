@@ -123,7 +123,7 @@ def read_training_data(
             are not those of the data.
     """
     keys = list(config.dimensions)
-    trajectories = load_trajectories(meta, keys, optional)
+    trajectories = load_trajectories(meta, _recorded(config, meta), optional)
     check_frame_numbers(meta, keys, None if len(run.episodes) == meta.total_episodes else run.episodes)
     features = {**(config.input_features or {}), **(config.output_features or {})}
     identity = NormalizationMode.IDENTITY
@@ -135,8 +135,29 @@ def read_training_data(
 
 
 def read_demonstrations(config: StateConfig, meta: LeRobotDatasetMetadata) -> Trajectories:
-    """What a policy takes from a dataset that it need not train on: observations, actions, outcomes."""
-    return load_trajectories(meta, [*config.observation_keys, ACTION], (*OUTCOMES, *LABELLED_BY))
+    """What a policy takes from a dataset that it need not train on: observations, actions, outcomes.
+
+    Raises:
+        ValueError: If a feature is missing or no numbers.
+    """
+    return load_trajectories(meta, _recorded(config, meta), (*OUTCOMES, *LABELLED_BY))
+
+
+def _recorded(config: StateConfig, meta: LeRobotDatasetMetadata) -> list[str]:
+    """The features to read.
+
+    Raises:
+        ValueError: If one over which demonstrations are to be compared is none of numbers.
+    """
+    keys = config.recorded_keys if isinstance(config, BCConfig) else list(config.dimensions)
+    known = [key for key, feature in meta.features.items() if is_numeric(feature)]
+    unknown = [key for key in keys if key not in known and key not in config.dimensions]
+    if unknown:
+        raise ValueError(
+            f"similarity_keys={keys}: {', '.join(unknown)} are no numbers of {meta.root}, which has "
+            f"{', '.join(known)}"
+        )
+    return keys
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +206,7 @@ class TrainingData:
                 f"of the checkpoint ({config.num_episodes} episodes, fingerprint {known}); resume with the "
                 "original dataset, or fine-tune on this one with --policy.path instead of --resume"
             )
+        run = run.without_short(trajectories.lengths, config.unseen_frames, trajectories.name)
         # A demonstrator may wait for something that only a picture shows.
         pauses = (
             _find_pauses(trajectories, config) if config.skip_pauses and not config.image_features else None

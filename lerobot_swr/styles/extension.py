@@ -100,7 +100,7 @@ def add_demonstrations(
     described = None if same else _described(policy, added, robot_type)
 
     candidates = np.flatnonzero(trained)
-    both = training.followed_by(added, list(config.dimensions))
+    both = training.followed_by(added, config.recorded_keys)
     similarity = similarity_by(both, config.manner, Path(training.name))
     rows = np.arange(len(training), len(both))  # the added ones
     ranked, _ = similarity.nearest(rows, STARTS, candidates)

@@ -20,6 +20,8 @@ class ToyPolicy(PreTrainedPolicy):
         super().__init__(config)
         self.layer = nn.Linear(config.robot_state_feature.shape[0], config.chunk_size * 2)
         self.updates = 0
+        if config.reads == "raises":
+            raise RuntimeError("no room")
         self.reset()
 
     def get_optim_params(self):

@@ -1,6 +1,7 @@
 """Begins from a checkpoint of a backbone without styles: its options and weights stay."""
 
 import logging
+from collections.abc import Collection
 from dataclasses import MISSING, Field, fields
 from pathlib import Path
 from typing import Any
@@ -25,13 +26,13 @@ OUTER = (
 logger = logging.getLogger(__name__)
 
 
-def adopt_options(backbone: PreTrainedConfig) -> None:
+def adopt_options(backbone: PreTrainedConfig, given: Collection[str] = ()) -> None:
     """Take the options of the checkpoint at ``pretrained_path``, except those that are given.
 
-    An option counts as given where it differs from its default.
-
     Args:
-        backbone: The policy's configuration, changed in place.
+        backbone: The policy's configuration, changed in place. An option of it that differs from its default
+            counts as given, too.
+        given: Names of options that are given.
 
     Raises:
         ValueError: If the checkpoint is one of another policy.
@@ -50,7 +51,8 @@ def adopt_options(backbone: PreTrainedConfig) -> None:
             f"{where} is a checkpoint of {stored.type!r}, policy.backbone.type={backbone.type!r}{more}"
         )
     for option in fields(backbone):
-        if option.init and option.name not in OUTER and getattr(backbone, option.name) == _default(option):
+        kept = option.name in OUTER or option.name in given
+        if option.init and not kept and getattr(backbone, option.name) == _default(option):
             setattr(backbone, option.name, getattr(stored, option.name))
 
 

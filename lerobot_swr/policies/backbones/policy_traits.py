@@ -16,9 +16,10 @@ from lerobot_swr.policies.backbones.plain_checkpoint import adopt_options, load_
 from lerobot_swr.policies.backbones.style_place import AUTO, check_takes_style, make_with_style
 from lerobot_swr.policies.backbones.style_probe import invented_batch
 from lerobot_swr.policies.backbones.traits import Traits
-from lerobot_swr.policies.backbones.wrapped_policy import WrappedPolicy, make_policy_of
+from lerobot_swr.policies.backbones.wrapped_policy import WrappedPolicy, make_policy_of, make_styled_policy_of
 from lerobot_swr.policies.state_config import StateConfig
 from lerobot_swr.policies.vector_pipelines import FloatVectorsProcessorStep, Pipelines, prepared_statistics
+from lerobot_swr.run_context import given_below
 
 if TYPE_CHECKING:
     from lerobot_swr.policies.configuration_swr import BCConfig
@@ -52,7 +53,14 @@ class PolicyTraits(Traits):
         """See `Traits.settle`."""
         backbone, where = self.backbone, f"policy.backbone.type={self.backbone.type!r}"
         if config.num_episodes is None and backbone.pretrained_path is not None:
-            adopt_options(backbone)
+            adopt_options(backbone, given_below("policy.backbone"))
+        if config.num_episodes is not None and "pretrained_path" in given_below(
+            "policy.backbone", files=False
+        ):
+            raise ValueError(
+                f"policy.backbone.pretrained_path={str(backbone.pretrained_path)!r}: the weights come from "
+                "the checkpoint at policy.path; give one of the two"
+            )
         self._refuse_foreign_options(config)
         if getattr(config, "corrective", "none") != "none":
             raise ValueError(
@@ -135,7 +143,7 @@ class PolicyTraits(Traits):
         if style_dim == 0:
             policy = make_policy_of(plain, more)
         else:
-            build = partial(make_policy_of, more=more)
+            build = partial(make_styled_policy_of, more=more)
             place, policy = make_with_style(plain, build, getattr(config, "style_key", AUTO), style_dim, pre)
             config.style_key = place.name  # type: ignore[attr-defined]
         if pre is not None and self.backbone.pretrained_path is not None:

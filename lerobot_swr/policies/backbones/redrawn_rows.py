@@ -23,7 +23,7 @@ def redrawn(batch: dict[str, Any], weight: Tensor, uniform: float) -> tuple[dict
     rows = systematic_rows(weight, uniform)
     if torch.equal(rows, torch.arange(len(rows), device=rows.device)):
         return batch, factor
-    return picked_rows(batch, rows), factor
+    return picked_rows(batch, rows, len(weight)), factor
 
 
 def weigh_alike(weight: Tensor) -> bool:
@@ -50,13 +50,13 @@ def systematic_rows(weight: Tensor, uniform: float) -> Tensor:
     return rows.clamp(max=last)
 
 
-def picked_rows(batch: dict[str, Any], rows: Tensor) -> dict[str, Any]:
-    """Some rows of a batch."""
+def picked_rows(batch: dict[str, Any], rows: Tensor, count: int) -> dict[str, Any]:
+    """Some rows of a batch; what is not one value per frame stays."""
     places = rows.tolist()
     picked = dict(batch)
     for key, value in batch.items():
-        if isinstance(value, Tensor) and value.ndim > 0:
+        if isinstance(value, Tensor) and value.ndim > 0 and len(value) == count:
             picked[key] = value[rows.to(value.device)]
-        elif isinstance(value, list | tuple):
+        elif isinstance(value, list | tuple) and len(value) == count:
             picked[key] = [value[place] for place in places]
     return picked

@@ -4,20 +4,27 @@ They are this package's own, which register themselves here, and every policy th
 those of plugins and this package's baselines. What a style policy asks of either is in `traits`.
 """
 
+import sys
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import draccus
 import lerobot.policies  # noqa: F401  (registers LeRobot's policies)
 import numpy as np
-from lerobot.configs import PreTrainedConfig
+from lerobot.configs import PreTrainedConfig, parser
 
 from lerobot_swr.object_poses import Names
 from lerobot_swr.policies.backbones.backbone import Backbone
 
 DEFAULT = "mlp"
+
+
+@dataclass
+class WithoutOptions:
+    """Stands in for a policy that the command line is not about."""
 
 
 @dataclass
@@ -33,13 +40,23 @@ class BackboneConfig(draccus.ChoiceRegistry):
 
     @classmethod
     def get_known_choices(cls) -> dict[str, Any]:
-        """Names and classes of all backbones' configurations."""
+        """Names of all backbones to the classes whose options draccus offers as flags.
+
+        Of the policies these are the options of those that the command line is about: to offer the thousands
+        of all of them, in each of ``bc``, ``zbc`` and ``wzbc``, would cost every command of LeRobot seconds.
+        """
+        offered = _offered([*sys.argv[1:], *parser.get_yaml_overrides("policy")])
         policies = {
-            name: policy
-            for name, policy in PreTrainedConfig.get_known_choices().items()
-            if not getattr(policy, "has_backbone", False)
+            name: policy if offered is None or name in offered else WithoutOptions
+            for name, policy in cls.policies().items()
         }
         return {**policies, **cls._choice_registry}
+
+    @staticmethod
+    def policies() -> dict[str, Any]:
+        """Names and configurations of all policies that can be backbones."""
+        known = PreTrainedConfig.get_known_choices().items()
+        return {name: policy for name, policy in known if not getattr(policy, "has_backbone", False)}
 
     @classmethod
     def get_choice_class(cls, name: str) -> Any:
@@ -48,7 +65,7 @@ class BackboneConfig(draccus.ChoiceRegistry):
         Raises:
             KeyError: If there is none.
         """
-        return cls.get_known_choices()[name]
+        return {**cls.policies(), **cls._choice_registry}[name]
 
     @classmethod
     def get_choice_name(cls, subcls: type) -> str:
@@ -57,7 +74,7 @@ class BackboneConfig(draccus.ChoiceRegistry):
         Raises:
             ValueError: If it is none of a backbone.
         """
-        for name, known in cls.get_known_choices().items():
+        for name, known in {**cls.policies(), **cls._choice_registry}.items():
             if known is subcls:
                 return name
         raise ValueError(f"Cannot find choice name for {subcls}")
@@ -104,3 +121,17 @@ class BackboneConfig(draccus.ChoiceRegistry):
             style_dim: Dimension of a style; 0 for a policy without styles.
             action_dim: A.
         """
+
+
+def _offered(words: Sequence[str]) -> set[str] | None:
+    """The types of backbones that a command line is about; None for any, if it has options and no type."""
+    types, has_options = set(), False
+    for word, following in pairwise([*words, ""]):
+        flag, equals, value = word.partition("=")
+        if not flag.startswith("--") or "backbone." not in flag:
+            continue
+        if flag.endswith("backbone.type"):
+            types.add(value if equals else following)
+        else:
+            has_options = True
+    return None if has_options and not types else types

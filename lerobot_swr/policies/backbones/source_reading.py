@@ -14,8 +14,11 @@ def turns_state_into_text(config: PreTrainedConfig) -> bool:
     """Whether a policy's processor reads the state while the module of its network names no such observation.
 
     LeRobot's policies lie in modules called ``modeling_…`` and ``processor_…`` beside ``configuration_…``.
-    A policy whose modules are elsewhere, or not readable, is not judged.
+    A policy whose modules are elsewhere, a plugin's (whose network may lie in any file), or not readable, is
+    not judged.
     """
+    if not type(config).__module__.startswith("lerobot."):
+        return False
     network, processor = (_source(type(config).__module__, kind) for kind in ("modeling_", "processor_"))
     if network is None or processor is None:
         return False

@@ -128,7 +128,7 @@ def make_with_style(
     Raises:
         ValueError: If the policy cannot take a style there, saying why.
     """
-    reasons = {}
+    reasons, errors = {}, []
     for name in PLACES if wanted == AUTO else (wanted,):
         place = StylePlace(name, style_dim, PLACES[name] in (plain.input_features or {}))
         random_state = get_rng_state()
@@ -136,10 +136,13 @@ def make_with_style(
             policy, reason = _made(plain, build, place, preprocessor)
         except MISFITS as error:
             policy, reason = None, " ".join(f"{type(error).__name__}: {error}".split())
+            errors.append(reason)
         if policy is not None:
             return place, policy
         set_rng_state(random_state)  # the next attempt starts from the weights that it alone would have
         reasons[place.key] = reason
+    if len(reasons) > 1 and len(set(reasons.values())) == 1 and errors:
+        raise ValueError(f"policy.backbone.type={plain.type!r} cannot be made: {errors[0]}")
     told = "; ".join(f"through {key}: {reason}" for key, reason in reasons.items())
     raise ValueError(
         f"policy.backbone.type={plain.type!r} cannot take a style, {told}; use another backbone, e.g. act, "

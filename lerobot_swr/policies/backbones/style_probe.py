@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from lerobot.configs import FeatureType, PreTrainedConfig
 from lerobot.policies import PreTrainedPolicy
-from lerobot.utils.constants import ACTION
+from lerobot.utils.constants import ACTION, DONE, REWARD
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 from torch import Tensor, nn
 
@@ -128,5 +128,11 @@ def invented_batch(plain: PreTrainedConfig, windows: bool) -> dict[str, Any]:
                 batch[key] = torch.randn(*shape, *feature.shape, generator=generator)
             if indices is not None:
                 batch[f"{key}_is_pad"] = torch.zeros(shape, dtype=torch.bool)
+    rewarded = plain.reward_delta_indices if windows else None
+    if rewarded is not None:  # of policies that learn values
+        shape = (ROWS, len(rewarded))
+        batch[REWARD] = torch.rand(shape, generator=generator)
+        batch[DONE] = torch.zeros(shape, dtype=torch.bool)
+        batch |= {f"{key}_is_pad": torch.zeros(shape, dtype=torch.bool) for key in (REWARD, DONE)}
     numbers = {key: torch.arange(ROWS) for key in ("episode_index", "index")}
     return {**batch, **numbers, "task_index": torch.zeros(ROWS, dtype=torch.int64), "task": ["try"] * ROWS}

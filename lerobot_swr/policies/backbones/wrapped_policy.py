@@ -75,11 +75,9 @@ class WrappedPolicy(Backbone):
                 losses, numbers = self.policy.forward(styled, reduction="none")
                 self.numbers = _loggable(numbers)
                 return losses * weight
-            rows = torch.arange(len(weight), device=weight.device)
-            return (
-                torch.stack([self.policy.forward(picked_rows(styled, row))[0] for row in rows.split(1)])
-                * weight
-            )
+            rows = torch.arange(len(weight), device=weight.device).split(1)
+            single = [picked_rows(styled, row, len(weight)) for row in rows]
+            return torch.stack([self.policy.forward(one)[0] for one in single]) * weight
 
     @contextmanager
     def _drawing(self, device: torch.device) -> Iterator[float]:
@@ -136,15 +134,22 @@ class WrappedPolicy(Backbone):
 
     def predict_action_chunk(self, batch: dict[str, Tensor], style: Tensor | None, **options: Any) -> Tensor:
         """The policy's chunk; options are its own (real-time chunking's, noise)."""
+        self._note(style)
         return self.policy.predict_action_chunk(self._styled(batch, style), **options)
 
     def select_action(self, batch: dict[str, Tensor], style: Tensor | None, **options: Any) -> Tensor:
         """The policy's next action: of the chunk under way, or of a new one with this style."""
-        if style is not None and self.place is not None:
-            if self._acted is not None and not torch.equal(self._acted, style):
-                self.place.rewrite(getattr(self.policy, "_queues", None), style)
-            self._acted = style
+        self._note(style)
         return self.policy.select_action(self._styled(batch, style), **options)
+
+    def _note(self, style: Tensor | None) -> None:
+        """Put a style into the observations that the policy remembers, where it is another than theirs."""
+        if style is None or self.place is None or self.training:
+            return
+        known = self._acted
+        if known is not None and known.shape == style.shape and not torch.equal(known, style):
+            self.place.rewrite(getattr(self.policy, "_queues", None), style)
+        self._acted = style
 
     def reset(self) -> None:
         """Forget chunks and histories."""
@@ -171,6 +176,16 @@ def make_policy_of(config: PreTrainedConfig, more: Mapping[str, Any]) -> PreTrai
     """
     given = {key: value for key, value in more.items() if value is not None}
     return get_policy_class(config.type)(config=config, **given).to(config.device)
+
+
+def make_styled_policy_of(config: PreTrainedConfig, more: Mapping[str, Any]) -> PreTrainedPolicy:
+    """The same of a configuration with a style, which a dataset does not have.
+
+    The dataset's metadata are left out where the policy does without: it might compare features with them.
+    """
+    dataset = inspect.signature(get_policy_class(config.type)).parameters.get("dataset_meta")
+    needed = dataset is not None and dataset.default is inspect.Parameter.empty
+    return make_policy_of(config, {k: v for k, v in more.items() if needed or k != "dataset_meta"})
 
 
 def _loggable(numbers: Mapping[str, Any] | None) -> dict[str, float]:
