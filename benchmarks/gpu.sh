@@ -41,6 +41,7 @@ train() { # name kind prefix-of-the-network's-options flags...
     for option in ${!small}; do tiny+=("--$prefix.$option"); done
     # A step after the time limit ends the run; the checkpoint is the last one before.
     timeout --signal=INT "$TRAIN_S" "$BIN/lerobot-train" "$@" "${tiny[@]}" \
+        --"$prefix".pretrained_backbone_weights=null `# of the internet; the time is the same without` \
         --policy.device="$DEVICE" --policy.push_to_hub=false \
         --dataset.repo_id=local/pusht --dataset.root="$DATASET" --dataset.video_backend=pyav \
         --batch_size="${BATCH:-64}" --num_workers="${WORKERS:-8}" --steps="$STEPS" --save_freq="${SAVE:-200}" \

@@ -61,8 +61,14 @@ class Film:
 
     def save(self, path: Path) -> None:
         """Write the GIF, with fewer frames and colours until it is small enough."""
-        for step, colours in ((1, 64), (1, 32), (2, 64), (2, 32), (3, 32), (4, 16)):
-            frames = [f.quantize(colours, dither=Image.Dither.NONE) for f in self._frames[::step]]
+        for step, colours in ((1, 256), (1, 128), (1, 64), (2, 128), (2, 64), (3, 32), (4, 16)):
+            # All frames have one palette, in which small spots of colour have their place.
+            shown = self._frames[::step]
+            sheet = Image.new("RGB", (GIF_WIDTH, sum(frame.height for frame in shown)))
+            for place, frame in enumerate(shown):
+                sheet.paste(frame, (0, place * frame.height))
+            palette = sheet.quantize(colours, method=Image.Quantize.MAXCOVERAGE)
+            frames = [f.quantize(palette=palette, dither=Image.Dither.NONE) for f in shown]
             buffer = io.BytesIO()
             frames[0].save(
                 buffer,
