@@ -4,6 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+ROUNDING = 1e-5  # relative error of a product in float32, generously
 TIE = 1e-5  # relative difference of squared distances below which scenes are equally near
 
 
@@ -28,7 +29,9 @@ class Scenes(nn.Module):
         self.scale: Tensor
         self.register_buffer("first", torch.full((num_episodes, dim), torch.nan))
         self.register_buffer("scale", torch.zeros(dim))
-        self._prepared: tuple[Tensor, Tensor, Tensor] | None = None  # allowed, first, (d, M) of these
+        self._prepared: tuple[Tensor, Tensor, Tensor, Tensor, Tensor] | None = (
+            None  # allowed, first, of these
+        )
 
     def fit(self, first: Tensor, varying: np.ndarray) -> None:
         """Take the demonstrations' first observations.
@@ -62,16 +65,23 @@ class Scenes(nn.Module):
         """
         counts = self.scale > 0
         scaled = (scene.to(self.first) * self.scale)[:, counts]  # (B, d)
-        columns = self._columns(allowed, counts)  # (d, M)
+        columns, norms, slack = self._columns(allowed, counts)
         found = []
         for row in scaled:
-            squared = (columns - row[:, None]).square_().sum(dim=0)
-            reach = squared.min() if k == 1 else squared.kthvalue(min(k, len(allowed))).values
-            found.append(allowed[squared <= (1 + TIE) * reach])
+            # Squared distances but for the row's own norm, up to rounding: one product with all M.
+            about = torch.addmv(norms, columns.T, row, alpha=-2)
+            far = about.min() if k == 1 else about.kthvalue(min(k, len(allowed))).values
+            near = torch.nonzero(about <= far + slack * (1 + row @ row)).squeeze(1)
+            squared = (columns[:, near] - row[:, None]).square_().sum(dim=0)
+            reach = squared.kthvalue(min(k, len(near))).values
+            found.append(allowed[near[squared <= (1 + TIE) * reach]])
         return found
 
-    def _columns(self, allowed: Tensor, counts: Tensor) -> Tensor:
-        """(d, M) scaled first observations of some episodes; the last ones asked for are kept."""
+    def _columns(self, allowed: Tensor, counts: Tensor) -> tuple[Tensor, ...]:
+        """(d, M) scaled first observations of some episodes, their squared norms, and how far rounding goes.
+
+        Those of the last ones asked for are kept.
+        """
         known = self._prepared
         if known is None or known[0] is not allowed or known[1] is not self.first:
             first = self.first[allowed]
@@ -82,5 +92,6 @@ class Scenes(nn.Module):
                     "policy anew, or use style_sampling='uniform'"
                 )
             columns = (first * self.scale)[:, counts].T.contiguous()
-            self._prepared = known = (allowed, self.first, columns)
-        return known[2]
+            norms = columns.square().sum(dim=0)
+            self._prepared = known = (allowed, self.first, columns, norms, ROUNDING * (1 + norms.max()))
+        return known[2:]
