@@ -196,7 +196,7 @@ def groups_within(
         parts = np.zeros(len(members), dtype=int)
         if len(members) >= SMALLEST_PARENT:
             places = main_places(members)
-            number, _ = support(places, rng, most=len(members) // 3).best(WITHIN_SEPARATION, WITHIN_STABILITY)
+            number, _ = support(places, rng).best(WITHIN_SEPARATION, WITHIN_STABILITY)
             parts = split(places, number)
         if parts.any():
             waiting += [members[parts == part] for part in np.unique(parts)]
