@@ -3,28 +3,38 @@
     python -m benchmarks.bench_behaviors
     python -m benchmarks.bench_behaviors --episodes=2000
     python -m benchmarks.bench_behaviors --known data/only_forward data/avoiding d3il_inserting_120.npz
+    python -m benchmarks.bench_behaviors --spoiled data/only_forward data/avoiding
+    python -m benchmarks.bench_behaviors --rollouts CHECKPOINT data/only_forward
 
-The last one compares what is found with known labels: by the rules of this package's own datasets, or of an
-archive with the arrays states, episode_index and behavior.
+With --known what is found is compared with known labels: by the rules of this package's own datasets, or of
+an archive with the arrays states, episode_index and behavior. With --spoiled five episodes are cut, reversed,
+frozen, full of noise, or on another way, before. With --rollouts the rule that was found labels 500 rollouts
+of a policy, beside the hand-written one.
 """
 
 import argparse
 import json
 import resource
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from sklearn.metrics import adjusted_rand_score
 
 from lerobot_swr.behavior_rules import dataset_behavior_rule
-from lerobot_swr.discovery.discover import discover
+from lerobot_swr.discovery.discover import OUTLIER, discover
+from lerobot_swr.discovery.rule import DiscoveredRule
 from lerobot_swr.discovery.sources import Source
-from lerobot_swr.evaluation.checkpoint import load_demonstrations
+from lerobot_swr.envs.maze2d.configuration_maze2d import Maze2DEnvConfig
+from lerobot_swr.evaluation.checkpoint import load_checkpoint, load_demonstrations
+from lerobot_swr.evaluation.rollouts import run_rollouts
 from lerobot_swr.trajectories import Trajectories
 
 STEPS, DIM, WAYS = 100, 14, 8
+SEEDS, ROLLOUTS = 3, 500
 STATE = "observation.state"
 
 
@@ -73,16 +83,79 @@ def compare(path: Path) -> None:
     print(json.dumps(result), flush=True)
 
 
+def spoiled(path: Path, seed: int) -> None:
+    """Print how many of five spoiled episodes are told, and how many good ones."""
+    trajectories, _ = known(path)
+    rng = np.random.default_rng(seed)
+    states = [np.array(episode[STATE], float) for episode in trajectories.episodes()]
+    frames = np.concatenate(states)
+    size, chosen = frames.std(axis=0), rng.choice(len(states), 5, replace=False).tolist()
+    cut, backwards, frozen, noisy, other = chosen
+    states[cut] = states[cut][: len(states[cut]) // 2]
+    states[backwards] = states[backwards][::-1]
+    states[frozen] = np.repeat(states[frozen][:1], len(states[frozen]), axis=0)
+    states[noisy] = states[noisy] + 0.3 * size * rng.standard_normal(states[noisy].shape)
+    corners = frames.mean(axis=0) + 1.2 * size * rng.standard_normal((5, len(size)))
+    along = np.linspace(0, 4, len(states[other]))
+    states[other] = np.stack([np.interp(along, range(5), c) for c in corners.T], axis=1)
+    columns = {STATE: np.concatenate(states).astype(np.float32)}
+    changed = Trajectories(np.array([len(s) for s in states]), columns, trajectories.fps, path.stem)
+    found = discover(changed, Source((STATE,)))
+    result = {
+        "dataset": path.stem,
+        "seed": seed,
+        "spoiled_told": sum(i in found.reasons for i in chosen),
+        "reasons": [found.reasons.get(i, "none").split(":")[0] for i in chosen],
+        "good_told": len(set(found.reasons) - set(chosen)),
+        "good": len(states) - 5,
+    }
+    print(json.dumps(result), flush=True)
+
+
+def label_rollouts(checkpoint: Path, path: Path) -> None:
+    """Print in how many rollouts the rule that was found agrees with the hand-written one."""
+    trajectories, labels = known(path)
+    found = discover(trajectories, Source((STATE,)))
+    rule = DiscoveredRule(found.features, found.names, found.groups, found.places, found.reach)
+    name = {
+        n: Counter(np.array(labels)[np.array(found.labels) == n]).most_common(1)[0][0] for n in found.names
+    }
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = checkpoint
+    hand = dataset_behavior_rule(None, LeRobotDatasetMetadata(f"local/{path.name}", root=path).robot_type)
+    rollouts = run_rollouts(load_checkpoint(config), Maze2DEnvConfig(task="medium"), hand, ROLLOUTS, 100, 0)
+    demonstrated = set(labels)
+    told = [name.get(rule(r.observations), OUTLIER) for r in rollouts]
+    wanted = [r.behavior if r.behavior in demonstrated else OUTLIER for r in rollouts]
+    result = {
+        "dataset": path.stem,
+        "rollouts": len(rollouts),
+        "agree": round(float(np.mean([t == w for t, w in zip(told, wanted, strict=True)])), 3),
+        "success": round(float(np.mean([r.success for r in rollouts])), 3),
+        "outliers": [told.count(OUTLIER), wanted.count(OUTLIER)],
+    }
+    print(json.dumps(result), flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument("--known", type=Path, nargs="+", help="datasets with known labels")
+    parser.add_argument("--spoiled", type=Path, nargs="+", help="datasets of which five episodes are spoiled")
+    parser.add_argument(
+        "--rollouts", type=Path, nargs=2, help="a checkpoint and its dataset of a medium maze"
+    )
     options = parser.parse_args()
-    if options.known:
-        for path in options.known:
-            compare(path)
+    for path in options.known or []:
+        compare(path)
+    for path in options.spoiled or []:
+        for seed in range(SEEDS):
+            spoiled(path, seed)
+    if options.rollouts:
+        label_rollouts(*options.rollouts)
+    if options.known or options.spoiled or options.rollouts:
         return
     episodes = options.episodes
     trajectories, labels = synthetic(episodes)
