@@ -67,8 +67,8 @@ def measure(cfg: SwitchCommand) -> None:
     for moment in moments:
         cells = [by_moment[moment] for by_moment in kept.values() if moment in by_moment]
         good, total = (sum(cell[k] for cell in cells) for k in (0, 1))
-        low, high = success_interval([True] * good + [False] * (total - good))
-        print(f"{moment}: {good}/{total} = {good / total:.3f} [{low:.3f}, {high:.3f}]")
+        interval = success_interval([True] * good + [False] * (total - good))
+        print(f"{moment}: {good}/{total} = {good / total:.3f} {interval:.3f}")
     print(f"steps to the first action of the new style: {dict(Counter(s.latency for s in switches))}")
     cfg.output_dir.mkdir(parents=True, exist_ok=True)
     path = cfg.output_dir / "style_switch.json"
