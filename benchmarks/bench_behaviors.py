@@ -3,6 +3,7 @@
     python -m benchmarks.bench_behaviors
     python -m benchmarks.bench_behaviors --episodes=2000
     python -m benchmarks.bench_behaviors --known data/only_forward data/avoiding d3il_inserting_120.npz
+    python -m benchmarks.bench_behaviors --known data/aligning --features=my_module:tool_from_box
     python -m benchmarks.bench_behaviors --spoiled data/only_forward data/avoiding
     python -m benchmarks.bench_behaviors --rollouts CHECKPOINT data/only_forward
 
@@ -68,10 +69,10 @@ def known(path: Path) -> tuple[Trajectories, list[str]]:
     return trajectories, [rule(episode) for episode in trajectories.episodes()]
 
 
-def compare(path: Path) -> None:
+def compare(path: Path, function: str | None) -> None:
     """Print how well the behaviours that are found agree with known labels."""
     trajectories, labels = known(path)
-    found = discover(trajectories, Source((STATE,)))
+    found = discover(trajectories, Source((STATE,), function))
     result = {
         "dataset": path.stem,
         "episodes": len(trajectories),
@@ -147,9 +148,10 @@ def main() -> None:
     parser.add_argument(
         "--rollouts", type=Path, nargs=2, help="a checkpoint and its dataset of a medium maze"
     )
+    parser.add_argument("--features", help="for --known, as lerobot-swr-behaviors takes it")
     options = parser.parse_args()
     for path in options.known or []:
-        compare(path)
+        compare(path, options.features)
     for path in options.spoiled or []:
         for seed in range(SEEDS):
             spoiled(path, seed)

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from sklearn.metrics import adjusted_rand_score, silhouette_samples
 from ways import STATE, dataset, one_way, three_ways, way
 
-from lerobot_swr.discovery.clusters import _silhouettes, adjusted_rand, split, support
+from lerobot_swr.discovery.clusters import split, support
 from lerobot_swr.discovery.discover import discover
 from lerobot_swr.discovery.sources import Source
 
@@ -60,14 +59,3 @@ def test_support_finds_the_number_of_clouds():
     assert support(points, rng).supported(0.05, 0.85)[3]
     for cloud in (rng.standard_normal((80, 3)), rng.uniform(size=(80, 3))):
         assert support(cloud, rng).best(0.05, 0.85)[0] == 1
-
-
-def test_silhouettes_and_agreement_are_those_of_scikit_learn():
-    """The fast versions give the same numbers."""
-    rng = np.random.default_rng(1)
-    points = np.concatenate([rng.standard_normal((30, 4)), 3 + rng.standard_normal((20, 4))])
-    values, groups = _silhouettes(points, np.arange(2, 12))
-    for value, group in zip(values, groups, strict=True):
-        np.testing.assert_allclose(value, silhouette_samples(points, group), atol=1e-12)
-        assert adjusted_rand(groups[0], group) == pytest.approx(adjusted_rand_score(groups[0], group))
-    assert adjusted_rand(groups[0], groups[0]) == 1

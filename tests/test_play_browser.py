@@ -112,9 +112,9 @@ def test_five_demonstrations_by_mouse_are_saved_as_the_environment_did_them(tmp_
 
 @pytest.fixture(scope="module")
 def trained(small_maze, tmp_path_factory):
-    """A policy that has learned the small maze's six demonstrations."""
+    """A policy that has learned the small maze's six demonstrations, and the way back to each."""
     folder = tmp_path_factory.mktemp("trained") / "zbc"
-    flags = train_flags("zbc", small_maze, folder, 4000, "--seeds=0")
+    flags = train_flags("zbc", small_maze, folder, 8000, "--seeds=0", "--policy.corrective=noise")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["lerobot-swr-train", *flags])
         train_command.main()

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.spatial.distance import pdist, squareform
+from sklearn.metrics import adjusted_rand_score, silhouette_samples
 from sklearn.neighbors import NearestNeighbors
 
 MOST_GROUPS = 50
@@ -112,7 +113,9 @@ def support(points: np.ndarray, rng: np.random.Generator, most: int = MOST_GROUP
     for _ in range(draws):
         part = rng.choice(count, int(SHARE * count), replace=False)
         parts = _cuts(linkage(points[part], "ward"), numbers)
-        agreement.append([adjusted_rand(whole[part], own) for whole, own in zip(groups, parts, strict=True)])
+        agreement.append(
+            [adjusted_rand_score(whole[part], own) for whole, own in zip(groups, parts, strict=True)]
+        )
     return Support(
         numbers,
         (silhouettes - mean[:, None]) / (1 - mean[:, None]),
@@ -127,37 +130,14 @@ def _cuts(tree: np.ndarray, numbers: np.ndarray) -> np.ndarray:
 
 
 def _silhouettes(points: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(M, N) silhouette of each point for ascending numbers of groups, and (M, N) its group."""
+    """(M, N) silhouette of each point for each number of groups, and (M, N) its group."""
     condensed = pdist(points)
     groups, distances = _cuts(linkage(condensed, "ward"), numbers), squareform(condensed)
-    rows, values = np.arange(len(points)), np.zeros(groups.shape)
-    sums, finer = distances, rows  # (N, groups): distances to all of a group together
-    for m in range(len(numbers))[::-1]:
-        group = groups[m]
-        count = int(group.max()) + 1
-        joined = np.zeros((sums.shape[1], count))  # which of the finer groups are one now
-        joined[finer, group] = 1.0
-        sums, finer, sizes = sums @ joined, group, np.bincount(group, minlength=count)
-        if count < 2:
-            continue
-        means = sums / sizes
-        means[rows, group] = np.inf
-        within, beside = sums[rows, group] / np.maximum(sizes[group] - 1, 1), means.min(axis=1)
-        larger = np.maximum(np.maximum(within, beside), 1e-300)
-        values[m] = np.where(sizes[group] > 1, (beside - within) / larger, 0.0)
+    values = np.zeros(groups.shape)
+    for m, group in enumerate(groups):
+        if 0 < group.max() < len(points) - 1:
+            values[m] = silhouette_samples(distances, group, metric="precomputed")
     return values, groups
-
-
-def adjusted_rand(first: np.ndarray, second: np.ndarray) -> float:
-    """Adjusted Rand index of (N,) groups 0, 1, …, without scikit-learn's checks, which take longer."""
-    width = int(second.max()) + 1
-    both = np.bincount(first * width + second, minlength=(int(first.max()) + 1) * width).reshape(-1, width)
-    together, one, other, all_pairs = (
-        float((n * (n - 1.0) / 2).sum())
-        for n in (both, both.sum(axis=1), both.sum(axis=0), np.array(len(first)))
-    )
-    expected, most = one * other / all_pairs, (one + other) / 2
-    return 1.0 if most == expected else (together - expected) / (most - expected)
 
 
 def split(points: np.ndarray, number: int) -> np.ndarray:
