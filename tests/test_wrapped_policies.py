@@ -180,31 +180,19 @@ def test_a_style_is_kept_across_chunks_and_a_request_counts_from_the_next(make_s
     assert all(torch.equal(style, weight[2:3]) for style in seen[5:])
 
 
-def test_histories_take_on_a_new_style(make_styled, small_maze):
+@pytest.mark.parametrize("ask", ["select_action", "predict_action_chunk"])
+def test_histories_take_on_a_new_style(make_styled, small_maze, ask):
     """A diffusion policy's remembered observations have the style that its next chunk is planned for."""
     policy = make_styled("zbc", "diffusion", small_maze).eval()
     policy.reset()
     policy.styles.request([1])
     policy.select_action(observed(policy, small_maze, size=1))
     policy.styles.request([2])
-    policy.select_action(observed(policy, small_maze, size=1, row=1))
+    getattr(policy, ask)(observed(policy, small_maze, size=1, row=1))
     history = policy.backbone.policy._queues["observation.environment_state"]
     z = policy.styles.embedding.weight[2:3]
     assert all(torch.equal(remembered[:, -policy.config.style_dim :], z) for remembered in history)
     assert len(history) == 2
-
-
-def test_a_chunk_that_is_asked_for_takes_the_new_style_throughout(make_styled, small_maze):
-    """Its history, too, as LeRobot's asynchronous and real-time inference ask for chunks."""
-    policy = make_styled("zbc", "diffusion", small_maze).eval()
-    policy.reset()
-    policy.styles.request([1])
-    policy.select_action(observed(policy, small_maze, size=1))
-    policy.styles.request([2])
-    policy.predict_action_chunk(observed(policy, small_maze, size=1, row=1))
-    history = policy.backbone.policy._queues["observation.environment_state"]
-    z = policy.styles.embedding.weight[2:3]
-    assert all(torch.equal(remembered[:, -policy.config.style_dim :], z) for remembered in history)
 
 
 @pytest.mark.parametrize("kind", ["beso", "ddpm_gpt", "ddpm_act", "tdmpc"])
