@@ -1,7 +1,8 @@
 """What styles cost: a training step and an action of a style policy beside those of its plain backbone.
 
-Both are timed in one run, in rounds that take turns, on random data: with the small networks of the recipes,
-with and without two cameras of 96 × 96 pixels; smolvla with a tiny random model, where transformers is there.
+All are timed in one run, in rounds that take turns, on random episodes of unequal lengths: with the small
+networks of the recipes or, with --full, with the sizes that LeRobot has by default; with and without two
+cameras of 96 × 96 pixels; smolvla with a tiny random model, where transformers is there.
 """
 
 import argparse
@@ -25,6 +26,7 @@ import lerobot_swr  # noqa: F401
 from benchmarks.tiny_vlm import write_tiny_vlm
 from lerobot_swr.policies.backbones.style_probe import invented_batch
 
+KINDS = ("plain", "zbc", "wzbc")
 CAMERAS = ("observation.images.front", "observation.images.wrist")
 SMALL: dict[str, dict[str, Any]] = {
     "act": {
@@ -49,6 +51,14 @@ SMALL: dict[str, dict[str, Any]] = {
         "resize_imgs_with_padding": (64, 64),
     },
 }
+FULL: dict[str, dict[str, Any]] = {
+    "act": {"use_vae": False, "pretrained_backbone_weights": None},
+    "diffusion": {
+        "num_inference_steps": 10,
+        "noise_scheduler_type": "DDIM",
+        "pretrained_backbone_weights": None,
+    },
+}
 
 
 def write_data(root: Path, cameras: bool) -> LeRobotDatasetMetadata:
@@ -61,8 +71,8 @@ def write_data(root: Path, cameras: bool) -> LeRobotDatasetMetadata:
     features |= dict.fromkeys(CAMERAS, picture) if cameras else {}
     dataset = LeRobotDataset.create("local/bench", fps=10, root=root, features=features, use_videos=False)
     random = np.random.default_rng(0)
-    for _ in range(8):
-        for _ in range(20):
+    for length in range(16, 24):
+        for _ in range(length):
             frame = {key: random.normal(size=shape).astype(np.float32) for key, shape in numbers.items()}
             frame |= {k: random.integers(0, 255, (96, 96, 3), np.uint8) for k in CAMERAS} if cameras else {}
             dataset.add_frame({**frame, "task": "bench"})
@@ -72,14 +82,13 @@ def write_data(root: Path, cameras: bool) -> LeRobotDatasetMetadata:
 
 
 def make(
-    kind: str, styled: bool, meta: LeRobotDatasetMetadata, device: str, vlm: Path | None
+    kind: str, method: str, options: dict[str, Any], meta: LeRobotDatasetMetadata, device: str
 ) -> PreTrainedPolicy:
-    options = {**SMALL[kind], **({} if vlm is None else {"vlm_model_name": str(vlm)})}
     torch.manual_seed(0)
-    if not styled:
+    if method == "plain":
         return make_policy(make_policy_config(kind, device=device, **options), ds_meta=meta)
     backbone = PreTrainedConfig.get_choice_class(kind)(device=device, **options)
-    return make_policy(make_policy_config("zbc", backbone=backbone, device=device), ds_meta=meta)
+    return make_policy(make_policy_config(method, backbone=backbone, device=device), ds_meta=meta)
 
 
 def train_step(policy: PreTrainedPolicy, meta: LeRobotDatasetMetadata, batch_size: int) -> Callable[[], None]:
@@ -142,20 +151,20 @@ def race(runners: dict[str, Callable[[], None]], rounds: int) -> dict[str, float
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def compare(kind: str, cameras: bool, args: argparse.Namespace) -> None:
+def compare(kind: str, options: dict[str, Any], cameras: bool, args: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as folder:
         meta = write_data(Path(folder) / "data", cameras)
-        vlm = write_tiny_vlm(Path(folder) / "vlm") if kind == "smolvla" else None
-        policies = {
-            name: make(kind, name == "styled", meta, args.device, vlm) for name in ("plain", "styled")
-        }
+        if kind == "smolvla":
+            options = {**options, "vlm_model_name": str(write_tiny_vlm(Path(folder) / "vlm"))}
+        policies = {method: make(kind, method, options, meta, args.device) for method in KINDS}
         training = race({n: train_step(p, meta, args.batch_size) for n, p in policies.items()}, args.rounds)
         acting = race({n: act(p, meta) for n, p in policies.items()}, args.rounds)
     for what, seconds in (("training step", training), ("chunk", acting)):
+        plain = seconds.pop("plain")
+        styled = ", ".join(f"{n} {1e3 * s:7.1f} ms ({s / plain:.3f})" for n, s in seconds.items())
         print(
             f"{kind:>9} {'two cameras' if cameras else 'numbers':>11}, {what:>13}: plain "
-            f"{1e3 * seconds['plain']:7.1f} ms, styled {1e3 * seconds['styled']:7.1f} ms, "
-            f"ratio {seconds['styled'] / seconds['plain']:.3f}",
+            f"{1e3 * plain:7.1f} ms, {styled}",
             flush=True,
         )
 
@@ -165,9 +174,10 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--rounds", type=int, default=40)
     parser.add_argument("--batch_size", type=int, default=32)
     parser.add_argument("--device", default="cpu")
+    parser.add_argument("--full", action="store_true", help="LeRobot's default sizes of act and diffusion")
     args = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    for kind in SMALL:
+    for kind, options in (FULL if args.full else SMALL).items():
         if kind == "smolvla" and importlib.util.find_spec("transformers") is None:
             print(
                 "  smolvla: left out, transformers is not installed (pip install 'lerobot_policy_swr[vla]')"
@@ -176,7 +186,7 @@ def main(arguments: list[str] | None = None) -> None:
         for cameras in (False, True):
             if kind == "smolvla" and not cameras:
                 continue  # it needs a picture
-            compare(kind, cameras, args)
+            compare(kind, options, cameras, args)
 
 
 if __name__ == "__main__":

@@ -152,6 +152,18 @@ def test_a_run_goes_on_under_adam_and_comes_back():
     torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=4e-3)
 
 
+@pytest.mark.parametrize(("dtype", "kind"), [(torch.float32, RowAdam), (torch.bfloat16, SettlingAdam)])
+def test_rows_are_stepped_alone_where_numpy_can_read_them(dtype, kind):
+    """Elsewhere all rows are."""
+    options = {"lr": 1e-2, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0.0, "grad_clip_norm": 0.0}
+    table = nn.Parameter(torch.ones(ROWS, DIM, dtype=dtype))
+    optimizer = FusedAdamConfig(**options).build([{"params": [table], "by_rows": True}])
+    assert type(optimizer) is kind
+    nn.functional.embedding(torch.tensor([3]), table, sparse=table.grad is not None).sum().backward()
+    optimizer.step()
+    assert (table < 1).any(dim=1).nonzero().flatten().tolist() == [3]
+
+
 def test_a_frozen_embedding_stays_and_may_be_thawed():
     """As adapters freeze what they do not train."""
     model, _ = make(False)

@@ -16,7 +16,7 @@ from lerobot_swr.evaluation.checkpoint import Checkpoint
 from lerobot_swr.evaluation.metrics import Interval, success_interval
 from lerobot_swr.evaluation.open_loop import Replay, play
 from lerobot_swr.evaluation.rollouts import Rollout, run_rollouts
-from lerobot_swr.styles.drawing import StyleDrawing
+from lerobot_swr.styles.drawing import StyleDrawing, check_style_sampling
 from lerobot_swr.styles.request import StyleRequest
 from lerobot_swr.trajectories import Trajectories
 
@@ -230,4 +230,4 @@ def _demonstrations(
     if sampling not in ("uniform", "fixed"):
         sampling = "stratified"  # also for ways that draw by what is seen: here the scene follows the style
     set_seed(seed)
-    return StyleDrawing(sampling).draw(torch.tensor(chosen), count).tolist()  # type: ignore[arg-type]
+    return StyleDrawing(check_style_sampling(sampling)).draw(torch.tensor(chosen), count).tolist()

@@ -19,7 +19,10 @@ class FusedAdamConfig(AdamConfig):
         kwargs = asdict(self)
         kwargs.pop("grad_clip_norm")
         groups: Any = list(params)
-        by_rows = any(isinstance(group, dict) and group.get("by_rows") for group in groups)
+        rows = [
+            p for group in groups if isinstance(group, dict) and group.get("by_rows") for p in group["params"]
+        ]
+        by_rows = bool(rows) and all(p.device.type == "cpu" and p.dtype == torch.float32 for p in rows)
         # Several processes exchange whole gradients; weight decay moves all rows in every step.
         alone = not (torch.distributed.is_available() and torch.distributed.is_initialized())
         if by_rows and alone and self.weight_decay == 0:

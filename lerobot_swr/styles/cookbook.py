@@ -36,10 +36,9 @@ class StyleCookbook(nn.Module):
         num_episodes: N.
         style_dim: Dimension of z.
         init_scale: Standard deviation of the normal initialisation.
-        sampling: How they are drawn; see `StyleDrawing`.
+        sampling, near_scenes: How they are drawn; see `StyleDrawing`.
         selection: Which styles may be drawn; by default all that were trained.
         scene_dim: Dimensions of an observation, for ``scene``.
-        near_scenes: As in `StyleDrawing`.
 
     Raises:
         ValueError: For an unknown way of sampling, or a selection that is empty or out of range.
@@ -65,7 +64,8 @@ class StyleCookbook(nn.Module):
         self.register_buffer("trained", torch.zeros(num_episodes, dtype=torch.uint8))
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
-        self._vectors: Tensor | None = None
+        # (B, style_dim) the active styles; another tensor when they change.
+        self._acting = torch.empty(0)
         self._resolved: ResolvedSelection | None = None
         self._names: list[str | None] = []
         self._change = False
@@ -254,47 +254,45 @@ class StyleCookbook(nn.Module):
             ValueError: If the batch size changes within a rollout.
         """
         if self.active is None:
-            self.active, self._vectors = self._next(batch_size, tasks, scene)
-            self._names, self._change = self._filter_names(batch_size, tasks), False
+            self.active, self._acting = self._next(batch_size, tasks, scene)
+            self._names = self._filter_names(batch_size, tasks)
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
                 "call policy.reset() before a rollout with another number of environments"
             )
         self._follow(batch_size, tasks, scene)
-        return self.embedding(self.active) if self._vectors is None else self._vectors
+        return self._acting
 
     def _follow(self, batch_size: int, tasks: Sequence[str], scene: Tensor | None) -> None:
         """Change the active styles where a request or a task string says so since the last step."""
         assert self.active is not None
         if self._change:
-            self.active, self._vectors = self._next(batch_size, tasks, scene)
-            self._change = False
+            self.active, self._acting = self._next(batch_size, tasks, scene)
         elif self.asked is None:
             names = self._filter_names(batch_size, tasks)
-            changed = [k for k, name in enumerate(names) if name is not None and name != self._names[k]]
-            if changed:
-                self.active = self.active.clone()
-                self.active[changed] = self.draw(
-                    len(changed), [tasks[k] for k in changed], None if scene is None else scene[changed]
-                )
-                if self._vectors is not None:
-                    self._vectors[changed] = self.embedding(self.active[changed]).detach()
+            new = [k for k, name in enumerate(names) if name is not None and name != self._names[k]]
+            if new:
+                drawn = self.draw(len(new), [tasks[k] for k in new], None if scene is None else scene[new])
+                place = torch.tensor(new, device=drawn.device)
+                self.active = self.active.index_copy(0, place, drawn)
+                self._acting = self._acting.index_copy(0, place, self.embedding.weight.detach()[drawn])
             self._names = names
 
-    def _next(
-        self, batch_size: int, tasks: Sequence[str], scene: Tensor | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """(B,) episodes for a rollout; where styles are no episode's, `BLENDED` and (B, style_dim) styles."""
-        asked = self.asked
+    def _next(self, batch_size: int, tasks: Sequence[str], scene: Tensor | None) -> tuple[Tensor, Tensor]:
+        """(B,) episodes for a rollout, `BLENDED` where a style is no episode's, and (B, style_dim) styles."""
+        asked, self._change = self.asked, False
         if asked is None or isinstance(asked, StyleSelection):
-            return self.draw(batch_size, tasks, scene), None
-        places, device = asked.places(self._taken, batch_size), self.trained.device
-        self._taken += batch_size
-        if asked.vectors is not None:
-            return torch.full((batch_size,), BLENDED), asked.vectors.to(device)[places]
-        if asked.choices is None:
-            return torch.tensor(asked.episodes, device=device)[places], None
-        choices = {f"choice {k}": torch.tensor(c, device=device) for k, c in enumerate(asked.choices)}
-        names = [f"choice {k}" for k in places.tolist()]
-        return self._draw_each(names, lambda name: choices[str(name)], scene), None
+            episodes = self.draw(batch_size, tasks, scene)
+        else:
+            places, device = asked.places(self._taken, batch_size), self.trained.device
+            self._taken += batch_size
+            if asked.vectors is not None:
+                return torch.full((batch_size,), BLENDED, device=device), asked.vectors.to(device)[places]
+            if asked.choices is None:
+                episodes = torch.tensor(asked.episodes, device=device)[places]
+            else:
+                of = {f"choice {k}": torch.tensor(c, device=device) for k, c in enumerate(asked.choices)}
+                names = [f"choice {k}" for k in places.tolist()]
+                episodes = self._draw_each(names, lambda name: of[str(name)], scene)
+        return episodes, self.embedding.weight.detach()[episodes]
