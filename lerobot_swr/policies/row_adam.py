@@ -2,14 +2,36 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-FROM_ROWS = 10_000  # below, a step over all rows costs next to nothing
+FROM_ROWS = 50_000  # below, a step over all rows costs less
 SHARE_LEFT = 1e-3  # of a row's movement by its momentum, at which it is left alone
+
+
+MEANS = ("exp_avg", "exp_avg_sq")  # Adam's names of its two running means, of gradients and their squares
+
+
+@dataclass(frozen=True)
+class Moving:
+    """The rows that moved in the last step, with their state side by side: few, so they stay in the cache.
+
+    Attributes:
+        rows: (m,) int64, by the step of their last gradient, then by number.
+        means: Two (m, d), in the order of `MEANS`; the optimizer's state holds them as they once were.
+    """
+
+    rows: np.ndarray
+    means: tuple[np.ndarray, np.ndarray]
+
+    def put_back(self, state: dict[str, Tensor], which: np.ndarray | slice = slice(None)) -> None:
+        """Bring the optimizer's state of some of the rows up to date."""
+        for name, mean in zip(MEANS, self.means, strict=True):
+            state[name].numpy()[self.rows[which]] = mean[which]
 
 
 class RowAdam(torch.optim.Adam):
@@ -34,7 +56,7 @@ class RowAdam(torch.optim.Adam):
     def __init__(self, params: Any, **options: Any):
         super().__init__(params, fused=True, **options)
         self._touched: dict[Tensor, list[np.ndarray]] = {}  # rows that have a gradient
-        self._moving: dict[Tensor, np.ndarray] = {}  # sorted rows that moved in the last step
+        self._moving: dict[Tensor, Moving] = {}
         self._embeddings()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -63,7 +85,7 @@ class RowAdam(torch.optim.Adam):
             touched = [] if param.grad is None else self._touched[param]
             touched = [*touched, rows]
             if sum(map(len, touched)) > len(param):
-                touched = [np.unique(np.concatenate(touched))]
+                touched = [_sorted(touched)]
             self._touched[param] = touched
 
         return note
@@ -96,24 +118,33 @@ class RowAdam(torch.optim.Adam):
         state, rest = self._prepared(param, group), _steps_to_rest(group)
         state["step"] += 1
         step, moved = float(state["step"]), state["moved"].numpy()
-        rows = np.concatenate([np.arange(0), *self._touched[param]])
+        touched = _sorted(self._touched[param])
         # Up to which step the rows' states are known; since then they decayed.
-        missed = (step - 1) - np.minimum(moved[rows] + (rest - 1), step - 1)
-        if missed.any():
-            for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
-                state[name].numpy()[rows] *= np.power(np.float32(beta), missed)[:, None]
-        moved[rows] = step
+        missed = (step - 1) - np.minimum(moved[touched] + (rest - 1), step - 1)
+        moved[touched] = step
         before = self._moving[param]
-        # In one order, however they came together.
-        self._moving[param] = moving = np.union1d(before[moved[before] > step - rest], rows)
+        last = moved[before.rows]
+        stays = (last > step - rest) & (last < step)
+        before.put_back(state, np.flatnonzero(~stays))
+        kept = np.flatnonzero(stays)
+        rows = np.concatenate([before.rows[kept], touched])
+        decayed = [state[name].numpy()[touched] for name in MEANS]
+        for mean, beta in zip(decayed, group["betas"], strict=True):
+            mean *= np.power(np.float32(beta), missed)[:, None]
+        means, squares = [
+            np.concatenate([mean.take(kept, axis=0), of_touched])
+            for mean, of_touched in zip(before.means, decayed, strict=True)
+        ]
         assert param.grad is not None
-        changed = [tensor.detach().numpy() for tensor in (param, state["exp_avg"], state["exp_avg_sq"])]
-        values, means, squares = [[torch.from_numpy(array.take(moving, axis=0))] for array in changed]
+        gradients = np.zeros_like(means)
+        gradients[len(rows) - len(touched) :] = param.grad.numpy()[touched]
+        values = param.detach().numpy().take(rows, axis=0)
+        parts = [[torch.from_numpy(array)] for array in (values, gradients, means, squares)]
         torch._fused_adam_(
-            values,
-            [torch.from_numpy(param.grad.numpy().take(moving, axis=0))],
-            means,
-            squares,
+            parts[0],
+            parts[1],
+            parts[2],
+            parts[3],
             [],
             [state["step"]],
             lr=group["lr"],  # which a schedule changes
@@ -124,21 +155,39 @@ class RowAdam(torch.optim.Adam):
             amsgrad=False,
             maximize=False,
         )
-        for array, (value,) in zip(changed, (values, means, squares), strict=True):
-            array[moving] = value.numpy()
+        param.detach().numpy()[rows] = values
+        self._moving[param] = Moving(rows, (means, squares))
 
     def _prepared(self, param: Tensor, group: dict[str, Any]) -> dict[str, Tensor]:
         """The parameter's state, new or as a checkpoint of this optimizer or of Adam has it."""
         state, rest = self.state[param], _steps_to_rest(group)
         if "exp_avg" not in state:
             state["step"] = torch.zeros(())
-            state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(param), torch.zeros_like(param)
+            state.update({name: torch.zeros_like(param) for name in MEANS})
         if "moved" not in state:  # the step of a row's last gradient
             state["moved"] = torch.full((len(param),), float(state["step"]))
             state["moved"] -= (state["exp_avg"] == 0).all(dim=1) * (rest - 1.0)
         if param not in self._moving:
-            self._moving[param] = np.flatnonzero(state["moved"].numpy() > float(state["step"]) + 1 - rest)
+            moved = state["moved"].numpy()
+            rows = np.flatnonzero(moved > float(state["step"]) + 1 - rest)
+            rows = rows[moved[rows].argsort(kind="stable")]
+            means, squares = [state[name].numpy()[rows] for name in MEANS]
+            self._moving[param] = Moving(rows, (means, squares))
         return state
+
+    def state_dict(self) -> dict[str, Any]:
+        """As any optimizer's."""
+        self._put_back()
+        return super().state_dict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is copied."""
+        self._put_back()
+        return super().__getstate__()
+
+    def _put_back(self) -> None:
+        for param, moving in self._moving.items():
+            moving.put_back(self.state[param])
 
     def load_state_dict(self, state_dict: Any) -> None:
         """As any optimizer does; which groups are ``by_rows`` stays as it is."""
@@ -150,6 +199,7 @@ class RowAdam(torch.optim.Adam):
 
     def settle(self) -> None:
         """Bring all rows' states up to now: they are then those of `torch.optim.Adam`."""
+        self._put_back()
         settle(self)
         self._moving = {}
 
@@ -172,9 +222,18 @@ def settle(optimizer: torch.optim.Optimizer) -> None:
             if "moved" not in state:
                 continue
             missed = (state["step"] - (state["moved"] + (_steps_to_rest(group) - 1))).clamp(min=0)
-            for name, beta in zip(("exp_avg", "exp_avg_sq"), group["betas"], strict=True):
+            for name, beta in zip(MEANS, group["betas"], strict=True):
                 state[name] *= torch.pow(beta, missed)[:, None]
             del state["moved"]
+
+
+def _sorted(parts: list[np.ndarray]) -> np.ndarray:
+    """The numbers in all parts, each once; for few of them `np.unique` takes several times as long."""
+    rows = np.concatenate(parts) if parts else np.arange(0)
+    rows.sort()
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = rows[1:] != rows[:-1]
+    return rows[new]
 
 
 def _all_rows(param: Tensor) -> np.ndarray:

@@ -71,7 +71,9 @@ class Scenes(nn.Module):
             # Squared distances but for the row's own norm, up to rounding: one product with all M.
             about = torch.addmv(norms, columns.T, row, alpha=-2)
             far = about.min() if k == 1 else about.kthvalue(min(k, len(allowed))).values
-            near = torch.nonzero(about <= far + slack * (1 + row @ row)).squeeze(1)
+            most = float(far + slack * (1 + row @ row))
+            few = np.flatnonzero(about.cpu().numpy() <= most)  # in a tenth of torch's time
+            near = torch.from_numpy(few).to(about.device)
             squared = (columns[:, near] - row[:, None]).square_().sum(dim=0)
             reach = squared.kthvalue(min(k, len(near))).values
             found.append(allowed[near[squared <= (1 + TIE) * reach]])
