@@ -2,7 +2,8 @@
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr
 from typing import Any
 
 from tqdm import tqdm
@@ -63,6 +64,32 @@ def quieten_others() -> None:
     if not _is_terminal(sys.stderr):
         os.environ.setdefault("TQDM_MININTERVAL", f"{LOG_INTERVAL:g}")
         os.environ.setdefault("TQDM_MAXINTERVAL", f"{2 * LOG_INTERVAL:g}")
+
+
+@contextmanager
+def without_bars_in_logs() -> Iterator[None]:
+    """Within the block the bars of libraries in this process do not fill a log.
+
+    A bar begins all that it writes with a carriage return; whatever else goes to the standard error stays.
+    """
+    if _is_terminal(sys.stderr):
+        yield
+        return
+    with redirect_stderr(_Lasting(sys.stderr)):
+        yield
+
+
+class _Lasting:
+    """A file without what is meant to be written over."""
+
+    def __init__(self, file: Any):
+        self._file = file
+
+    def write(self, text: str) -> int:
+        return len(text) if text.startswith("\r") else self._file.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
 
 
 def _is_terminal(file: Any) -> bool:

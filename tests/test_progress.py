@@ -2,11 +2,13 @@
 
 import io
 import logging
+import sys
 
 import pytest
+from tqdm import tqdm
 
 from lerobot_swr import ffmpeg, progress
-from lerobot_swr.progress import Progress
+from lerobot_swr.progress import Progress, without_bars_in_logs
 
 LEROBOT_SAYS = (
     "Could not load libtorchcodec. Likely causes:\n{}Traceback ...\n'torchcodec' is installed but cannot be "
@@ -33,6 +35,20 @@ def test_a_log_gets_a_line_now_and_then_and_the_end(monkeypatch):
     assert "\r" not in log.getvalue()
     assert [line.split("|")[0] for line in lines] == ["Training:   0%", "Training: 100%"]
     assert "10000/10000" in lines[-1]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_a_librarys_bar_is_for_terminals_and_warnings_are_for_all(monkeypatch, terminal):
+    """A bar of tqdm's own in a block that is for terminals only."""
+    file = Terminal() if terminal else io.StringIO()
+    monkeypatch.setattr(sys, "stderr", file)
+    with without_bars_in_logs():
+        for _ in tqdm(range(3), leave=False, mininterval=0):
+            pass
+        print("a warning", file=sys.stderr)
+    assert "a warning\n" in file.getvalue()
+    assert ("\r" in file.getvalue()) == ("3/3" in file.getvalue()) == terminal
+    assert sys.stderr is file
 
 
 def test_a_slow_loop_shows_its_state_in_a_log(monkeypatch):

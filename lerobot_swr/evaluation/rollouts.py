@@ -14,6 +14,7 @@ from lerobot_swr.behaviors import BehaviorRule
 from lerobot_swr.envs.observed import as_simulated
 from lerobot_swr.envs.task import task_of
 from lerobot_swr.evaluation.checkpoint import Checkpoint
+from lerobot_swr.progress import without_bars_in_logs
 from lerobot_swr.styles.drawing import check_style_sampling
 from lerobot_swr.styles.request import BLENDED
 from lerobot_swr.trajectories import Trajectories
@@ -211,15 +212,16 @@ def run_rollouts(
         env = task_of(env_cfg).create_rollout_env(size)
         env = StateRecorder(env) if starts is None else StartedRecorder(env, starts[batch])
         try:
-            outcome = rollout(
-                env,
-                checkpoint.policy,
-                env_preprocessor,
-                env_postprocessor,
-                checkpoint.preprocessor,
-                checkpoint.postprocessor,
-                seeds=list(env_seeds[batch]),
-            )
+            with without_bars_in_logs():
+                outcome = rollout(
+                    env,
+                    checkpoint.policy,
+                    env_preprocessor,
+                    env_postprocessor,
+                    checkpoint.preprocessor,
+                    checkpoint.postprocessor,
+                    seeds=list(env_seeds[batch]),
+                )
             episodes = env.episodes()
         finally:
             env.close()
