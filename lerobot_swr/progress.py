@@ -70,7 +70,7 @@ def quieten_others() -> None:
 def without_bars_in_logs() -> Iterator[None]:
     """Within the block the bars of libraries in this process do not fill a log.
 
-    A bar begins all that it writes with a carriage return; whatever else goes to the standard error stays.
+    A bar begins with a carriage return, or moves the line; whatever else goes to the standard error stays.
     """
     if _is_terminal(sys.stderr):
         yield
@@ -83,10 +83,15 @@ class _Lasting:
     """A file without what is meant to be written over."""
 
     def __init__(self, file: Any):
-        self._file = file
+        self._file, self._after_bar = file, True
 
     def write(self, text: str) -> int:
-        return len(text) if text.startswith("\r") else self._file.write(text)
+        moves = not text.replace("\x1b[A", "").strip()  # to another line, or ends one
+        if text.startswith("\r") or (moves and (self._after_bar or "\x1b" in text)):
+            self._after_bar = True
+            return len(text)
+        self._after_bar = False
+        return self._file.write(text)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._file, name)

@@ -179,6 +179,68 @@ def test_a_frozen_embedding_stays_and_may_be_thawed():
         assert changed.nonzero().flatten().tolist() == ([1, 2] if thawed else [])
 
 
+def test_an_embedding_that_is_frozen_in_mid_run_stays():
+    """Whatever moved before; thawed it goes on as under Adam."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for model, optimizer in ((rows, by_rows), (dense, adam)):
+        train(model, optimizer, range(20))
+        optimizer.zero_grad()
+        before = model.table.detach().clone()
+        model.table.requires_grad_(False)
+        optimizer.step()
+        assert torch.equal(model.table, before)
+        model.table.requires_grad_(True)
+        train(model, optimizer, range(20, 100))
+    torch.testing.assert_close(rows.table, dense.table, rtol=0, atol=2e-3)
+
+
+def test_a_state_that_others_empty_begins_anew():
+    """Nothing of what moved before comes back."""
+    model, optimizer = make(True)
+    train(model, optimizer, range(20))
+    optimizer.state.clear()
+    optimizer.zero_grad()
+    before = model.table.detach().clone()
+    model.loss(torch.tensor([5]), True).backward()
+    optimizer.step()
+    assert (model.table != before).any(dim=1).nonzero().flatten().tolist() == [5]
+    assert optimizer.state_dict()["state"][1]["exp_avg"].any(dim=1).nonzero().flatten().tolist() == [5]
+
+
+def test_scaled_gradients_are_scaled_back_and_infinite_ones_passed_over():
+    """By torch's `GradScaler`: as Adam."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for model, optimizer in ((rows, by_rows), (dense, adam)):
+        scaler = torch.amp.GradScaler("cpu", init_scale=1024.0)
+        for step in range(6):
+            sparse = getattr(model.table, "by_rows", False) and model.table.grad is not None
+            loss = model.loss(torch.tensor([step % 3, 7]), sparse) * (float("inf") if step == 2 else 1)
+            scaler.scale(loss).backward()
+            scaler.step(optimizer)
+            scaler.update()
+            optimizer.zero_grad()
+    assert rows.table.isfinite().all()
+    torch.testing.assert_close(rows.table, dense.table, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+def test_gradients_that_come_in_other_ways_count(by_hand):
+    """Set by hand, or computed from what was seen before the model forgot its gradients."""
+    (rows, by_rows), (dense, adam) = make(True), make(False)
+    for model, optimizer in ((rows, by_rows), (dense, adam)):
+        sparse = getattr(model.table, "by_rows", False)
+        loss = model.loss(torch.tensor([4, 9]), sparse and not by_hand)
+        model.zero_grad()
+        if by_hand:
+            (model.table.grad,) = torch.autograd.grad(loss, [model.table])
+        else:
+            loss.backward()
+        optimizer.step()
+        optimizer.zero_grad()
+    torch.testing.assert_close(rows.table, dense.table, rtol=1e-5, atol=1e-6)
+    assert rows.table.grad.eq(0).all()
+
+
 @pytest.mark.parametrize("set_to_none", [True, False])
 def test_gradients_that_the_model_forgets_are_forgotten(set_to_none):
     """With ``model.zero_grad``, too, and without notes that grow from step to step."""

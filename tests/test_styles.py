@@ -179,3 +179,24 @@ def test_a_request_that_cannot_be_served_changes_nothing(styles, message):
         cookbook.request(styles)
     assert cookbook.asked is None
     assert torch.equal(cookbook.active_styles(2), before)
+
+
+def test_a_request_that_cannot_be_served_is_refused_at_every_step():
+    """And does not go back to the old style in silence."""
+    cookbook = StyleCookbook(6, 3, 0.1)
+    cookbook.trained[:] = 1
+    cookbook.select([1])
+    cookbook.active_styles(2)
+    cookbook.drawing.sampling = "scene"  # nothing is known of how demonstrations began
+    cookbook.request(StyleSelection([3]))
+    for _ in range(2):
+        with pytest.raises(ValueError, match="scene"):
+            cookbook.active_styles(2)
+
+
+def test_requested_styles_have_the_styles_type():
+    """Also those that come from NumPy as float64, when a task then names a filter."""
+    cookbook = StyleCookbook(6, 3, 0.1)
+    cookbook.trained[:] = 1
+    cookbook.request(torch.zeros(2, 3, dtype=torch.float64))
+    assert cookbook.active_styles(2).dtype == torch.float32

@@ -23,15 +23,21 @@ class Moving:
     Attributes:
         rows: (m,) int64, by the step of their last gradient, then by number.
         means: Two (m, d), in the order of `MEANS`; the optimizer's state holds them as they once were.
+        kept: Two (N, d), that state.
     """
 
     rows: np.ndarray
-    means: tuple[np.ndarray, np.ndarray]
+    means: list[np.ndarray]
+    kept: list[Tensor]
 
-    def put_back(self, state: dict[str, Tensor], which: np.ndarray | slice = slice(None)) -> None:
+    def put_back(self, which: np.ndarray | slice = slice(None)) -> None:
         """Bring the optimizer's state of some of the rows up to date."""
-        for name, mean in zip(MEANS, self.means, strict=True):
-            state[name].numpy()[self.rows[which]] = mean[which]
+        for kept, mean in zip(self.kept, self.means, strict=True):
+            kept.numpy()[self.rows[which]] = mean[which]
+
+    def is_of(self, state: dict[str, Tensor]) -> bool:
+        """Whether that is still the optimizer's state, which others may have replaced."""
+        return all(state.get(name) is kept for name, kept in zip(MEANS, self.kept, strict=True))
 
 
 class RowAdam(torch.optim.Adam):
@@ -55,6 +61,8 @@ class RowAdam(torch.optim.Adam):
 
     def __init__(self, params: Any, **options: Any):
         super().__init__(params, fused=True, **options)
+        self._step_supports_amp_scaling = False  # lets torch's GradScaler scale back and pass over steps
+        self._blocks: dict[Tensor, Tensor | None] = {}  # gradients, which others may replace
         self._touched: dict[Tensor, list[np.ndarray]] = {}  # rows that have a gradient
         self._moving: dict[Tensor, Moving] = {}
         self._embeddings()
@@ -63,7 +71,8 @@ class RowAdam(torch.optim.Adam):
         """Begin anew with what no copy and no file holds: it follows from the rest."""
         super().__setstate__(state)
         self._touched = self.__dict__.get("_touched", {})
-        self._moving = {}
+        self._blocks = self.__dict__.get("_blocks", {})
+        self._moving, self._step_supports_amp_scaling = {}, False
 
     def _embeddings(self) -> list[Tensor]:
         """The parameters that are stepped by rows, each with a block for its gradient."""
@@ -76,13 +85,16 @@ class RowAdam(torch.optim.Adam):
                 param.by_rows = True  # who computes gradients may send rows
                 if param.grad is None:
                     param.grad = torch.zeros_like(param)
+                self._blocks[param] = param.grad
         return params
 
     def _noting(self, param: Tensor) -> Callable[[Tensor], None]:
         def note(gradient: Tensor) -> None:
-            rows = gradient._indices()[0].numpy() if gradient.is_sparse else _all_rows(param)
+            rows = gradient._indices()[0].numpy().copy() if gradient.is_sparse else _all_rows(param)
             # Someone else may have forgotten the gradient, or have it grow over many batches.
             touched = [] if param.grad is None else self._touched[param]
+            if param.grad is None and gradient.is_sparse:
+                param.grad = self._blocks[param] = torch.zeros_like(param)
             touched = [*touched, rows]
             if sum(map(len, touched)) > len(param):
                 touched = [_sorted(touched)]
@@ -95,7 +107,7 @@ class RowAdam(torch.optim.Adam):
         kept = {param: param.grad for param in self._embeddings()}
         super().zero_grad(set_to_none)
         for param, gradient in kept.items():
-            param.grad = torch.zeros_like(param) if gradient is None else gradient
+            param.grad = self._blocks[param] = torch.zeros_like(param) if gradient is None else gradient
             for rows in self._touched[param]:
                 param.grad.numpy()[rows] = 0
             self._touched[param] = []
@@ -103,15 +115,20 @@ class RowAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
         """A step of Adam."""
-        gradients = {param: param.grad for param in self._embeddings() if param.grad is not None}
-        for param in gradients:
+        self._embeddings()
+        by_rows = [p for group in self.param_groups if group.get("by_rows") for p in group["params"]]
+        gradients = {param: param.grad for param in by_rows if param.grad is not None}
+        for param, gradient in gradients.items():
             param.grad = None  # Adam passes over it
+            if gradient is not self._blocks.get(param):
+                self._touched[param], self._blocks[param] = [_all_rows(param)], gradient
         result = super().step(closure)
         for group in self.param_groups:
             for param in group["params"] if group.get("by_rows") else ():
                 if param in gradients:
                     param.grad = gradients[param]
-                    self._step_rows(param, group)
+                    if param.requires_grad:
+                        self._step_rows(param, group)
         return result
 
     def _step_rows(self, param: Tensor, group: dict[str, Any]) -> None:
@@ -125,7 +142,7 @@ class RowAdam(torch.optim.Adam):
         before = self._moving[param]
         last = moved[before.rows]
         stays = (last > step - rest) & (last < step)
-        before.put_back(state, np.flatnonzero(~stays))
+        before.put_back(np.flatnonzero(~stays))
         kept = np.flatnonzero(stays)
         rows = np.concatenate([before.rows[kept], touched])
         decayed = [state[name].numpy()[touched] for name in MEANS]
@@ -156,7 +173,7 @@ class RowAdam(torch.optim.Adam):
             maximize=False,
         )
         param.detach().numpy()[rows] = values
-        self._moving[param] = Moving(rows, (means, squares))
+        self._moving[param] = Moving(rows, [means, squares], before.kept)
 
     def _prepared(self, param: Tensor, group: dict[str, Any]) -> dict[str, Tensor]:
         """The parameter's state, new or as a checkpoint of this optimizer or of Adam has it."""
@@ -167,12 +184,12 @@ class RowAdam(torch.optim.Adam):
         if "moved" not in state:  # the step of a row's last gradient
             state["moved"] = torch.full((len(param),), float(state["step"]))
             state["moved"] -= (state["exp_avg"] == 0).all(dim=1) * (rest - 1.0)
-        if param not in self._moving:
+        if param not in self._moving or not self._moving[param].is_of(state):
             moved = state["moved"].numpy()
             rows = np.flatnonzero(moved > float(state["step"]) + 1 - rest)
             rows = rows[moved[rows].argsort(kind="stable")]
-            means, squares = [state[name].numpy()[rows] for name in MEANS]
-            self._moving[param] = Moving(rows, (means, squares))
+            kept = [state[name] for name in MEANS]
+            self._moving[param] = Moving(rows, [mean.numpy()[rows] for mean in kept], kept)
         return state
 
     def state_dict(self) -> dict[str, Any]:
@@ -186,8 +203,8 @@ class RowAdam(torch.optim.Adam):
         return super().__getstate__()
 
     def _put_back(self) -> None:
-        for param, moving in self._moving.items():
-            moving.put_back(self.state[param])
+        for moving in self._moving.values():
+            moving.put_back()
 
     def load_state_dict(self, state_dict: Any) -> None:
         """As any optimizer does; which groups are ``by_rows`` stays as it is."""

@@ -243,7 +243,7 @@ class StyleCookbook(nn.Module):
     ) -> Tensor:
         """(B, style_dim) styles of the rollout under way, drawn at its first action and kept to its end.
 
-        They change before its end by a request, or where an environment's task string names another filter.
+        They stay as they were then, and change by a request, or where a task string names another filter.
 
         Args:
             batch_size: B.
@@ -255,7 +255,7 @@ class StyleCookbook(nn.Module):
         """
         if self.active is None:
             self.active, self._acting = self._next(batch_size, tasks, scene)
-            self._names = self._filter_names(batch_size, tasks)
+            self._names, self._change = self._filter_names(batch_size, tasks), False
         if len(self.active) != batch_size:
             raise ValueError(
                 f"batch of {batch_size} observations in a rollout of {len(self.active)} environments: "
@@ -269,6 +269,7 @@ class StyleCookbook(nn.Module):
         assert self.active is not None
         if self._change:
             self.active, self._acting = self._next(batch_size, tasks, scene)
+            self._change = False
         elif self.asked is None:
             names = self._filter_names(batch_size, tasks)
             new = [k for k, name in enumerate(names) if name is not None and name != self._names[k]]
@@ -281,14 +282,15 @@ class StyleCookbook(nn.Module):
 
     def _next(self, batch_size: int, tasks: Sequence[str], scene: Tensor | None) -> tuple[Tensor, Tensor]:
         """(B,) episodes for a rollout, `BLENDED` where a style is no episode's, and (B, style_dim) styles."""
-        asked, self._change = self.asked, False
+        asked = self.asked
         if asked is None or isinstance(asked, StyleSelection):
             episodes = self.draw(batch_size, tasks, scene)
         else:
             places, device = asked.places(self._taken, batch_size), self.trained.device
             self._taken += batch_size
             if asked.vectors is not None:
-                return torch.full((batch_size,), BLENDED, device=device), asked.vectors.to(device)[places]
+                blended = torch.full((batch_size,), BLENDED, device=device)
+                return blended, asked.vectors.to(self.embedding.weight)[places]
             if asked.choices is None:
                 episodes = torch.tensor(asked.episodes, device=device)[places]
             else:

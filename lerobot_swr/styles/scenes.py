@@ -72,7 +72,7 @@ class Scenes(nn.Module):
             about = torch.addmv(norms, columns.T, row, alpha=-2)
             far = about.min() if k == 1 else about.kthvalue(min(k, len(allowed))).values
             most = float(far + slack * (1 + row @ row))
-            few = np.flatnonzero(about.cpu().numpy() <= most)  # in a tenth of torch's time
+            few = np.flatnonzero(about.float().cpu().numpy() <= most)  # in a tenth of torch's time
             near = torch.from_numpy(few).to(about.device)
             squared = (columns[:, near] - row[:, None]).square_().sum(dim=0)
             reach = squared.kthvalue(min(k, len(near))).values

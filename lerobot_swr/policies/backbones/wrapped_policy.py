@@ -87,9 +87,10 @@ class WrappedPolicy(Backbone):
         uniform = float(torch.rand((), generator=generator, dtype=torch.float64))
         devices = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices):
-            torch.default_generator.manual_seed(seed)  # torch.manual_seed takes a millisecond for all devices
-            if device.type != "cpu":
-                torch.get_device_module(device).manual_seed(seed)
+            if device.type == "cpu":
+                torch.default_generator.manual_seed(seed)  # to seed every kind of device takes a millisecond
+            else:
+                torch.manual_seed(seed)
             yield uniform
 
     def _styled(self, batch: dict[str, Any], style: Tensor | None) -> dict[str, Any]:
