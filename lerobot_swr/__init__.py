@@ -15,9 +15,9 @@ Reading order, along the way data takes:
 Where is what:
 
 * algorithm 1: `lerobot_swr.policies.lessons.Relabel` draws the pair (i, j), by
-  `lerobot_swr.sampling.PartnerSampler`; W and ν are those of `lerobot_swr.similarity.distances`.
-* the gradient of a style: `lerobot_swr.policies.style_policy.StylePolicy.loss`, the only place where a style
-  is detached or not.
+  `lerobot_swr.sampling.PartnerSampler`; W and ν are defined in `lerobot_swr.similarity.distances`.
+* the gradient of a style: `lerobot_swr.policies.style_policy.StylePolicy._taught`, the only place where a
+  style is detached or not (fixed styles get none at all: `lerobot_swr.policies.style_making`).
 * a further backbone, task or check: `lerobot_swr.policies.backbones`, `lerobot_swr.envs.task`,
   `lerobot_swr.evaluation.checks`.
 

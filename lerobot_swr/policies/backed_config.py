@@ -40,7 +40,7 @@ class BackedConfig(StateConfig):
 
     # --- Training ---
     # "cosine" (to 0 at the run's last step, whatever --steps is) or "constant"; null takes the backbone's
-    # own, which for mlp is "cosine". The options optimizer_... are mlp's; other backbones have their own.
+    # own, which for mlp is "cosine". The options optimizer_... are mlp's; LeRobot's policies have their own.
     lr_schedule: str | None = None  # type: ignore[assignment]
     # Weight frames so that every episode counts the same, as the paper's sampling does (LeRobot draws frames
     # uniformly, which favours long episodes).

@@ -7,7 +7,6 @@
 * `sketch`: few numbers for each of these vectors, with bounds of what they leave out.
 * `neighbours`: the farthest and the nearest of many episodes, found by sketches and measured by vectors.
 * `cache`: what was found, kept beside the dataset.
-
 * `manner`: what of a demonstration is compared: its states, the hand's path about an object, or features.
 
 Training, pictures, the table of styles and the evaluations ask here; nobody else computes ν or W.

@@ -31,11 +31,13 @@ class WithoutOptions:
 class BackboneConfig(draccus.ChoiceRegistry):
     """Options of a backbone; one of this package's own registers itself with `register_subclass`.
 
-    Policies are looked up when they are asked for, so those that a plugin registers later count, too.
+    Policies are looked up when they are asked for, so those that a plugin registers later count, too. A name
+    that is a policy's stands for what is registered here.
     """
 
     # Whether many policies can be trained as one: the loss draws nothing at random, sees the observations of
-    # `make` alone, and `torch.vmap` takes it.
+    # `make` alone, and `torch.vmap` takes it, so that nothing branches on values. `Backbone.update` is not
+    # called then, and `Backbone.numbers` are not logged.
     is_stackable: ClassVar[bool] = False
 
     @classmethod
