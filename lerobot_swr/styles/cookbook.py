@@ -36,9 +36,10 @@ class StyleCookbook(nn.Module):
         num_episodes: N.
         style_dim: Dimension of z.
         init_scale: Standard deviation of the normal initialisation.
-        sampling, near_scenes: How they are drawn; see `StyleDrawing`.
+        sampling: How they are drawn; see `StyleDrawing`.
         selection: Which styles may be drawn; by default all that were trained.
         scene_dim: Dimensions of an observation, for ``scene``.
+        near_scenes: As in `StyleDrawing`.
 
     Raises:
         ValueError: For an unknown way of sampling, or a selection that is empty or out of range.
@@ -64,8 +65,7 @@ class StyleCookbook(nn.Module):
         self.register_buffer("trained", torch.zeros(num_episodes, dtype=torch.uint8))
         self.table: StyleTable | None = None
         self.active: Tensor | None = None
-        # (B, style_dim) the active styles; another tensor when they change.
-        self._acting = torch.empty(0)
+        self._acting = torch.empty(0)  # (B, style_dim) the active styles; another tensor when they change
         self._resolved: ResolvedSelection | None = None
         self._names: list[str | None] = []
         self._change = False
