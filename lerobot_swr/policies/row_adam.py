@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,30 +13,6 @@ SHARE_LEFT = 1e-3  # of a row's movement by its momentum, at which it is left al
 
 
 MEANS = ("exp_avg", "exp_avg_sq")  # Adam's names of its two running means, of gradients and their squares
-
-
-@dataclass(frozen=True)
-class Moving:
-    """The rows that moved in the last step, with their state side by side: few, so they stay in the cache.
-
-    Attributes:
-        rows: (m,) int64, by the step of their last gradient, then by number.
-        means: Two (m, d), in the order of `MEANS`; the optimizer's state holds them as they once were.
-        kept: Two (N, d), that state.
-    """
-
-    rows: np.ndarray
-    means: list[np.ndarray]
-    kept: list[Tensor]
-
-    def put_back(self, which: np.ndarray | slice = slice(None)) -> None:
-        """Bring the optimizer's state of some of the rows up to date."""
-        for kept, mean in zip(self.kept, self.means, strict=True):
-            kept.numpy()[self.rows[which]] = mean[which]
-
-    def is_of(self, state: dict[str, Tensor]) -> bool:
-        """Whether that is still the optimizer's state, which others may have replaced."""
-        return all(state.get(name) is kept for name, kept in zip(MEANS, self.kept, strict=True))
 
 
 class RowAdam(torch.optim.Adam):
@@ -64,7 +39,7 @@ class RowAdam(torch.optim.Adam):
         self._step_supports_amp_scaling = False  # lets torch's GradScaler scale back and pass over steps
         self._blocks: dict[Tensor, Tensor | None] = {}  # gradients, which others may replace
         self._touched: dict[Tensor, list[np.ndarray]] = {}  # rows that have a gradient
-        self._moving: dict[Tensor, Moving] = {}
+        self._moving: dict[Tensor, np.ndarray] = {}  # sorted rows that moved in the last step
         self._embeddings()
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -138,30 +113,20 @@ class RowAdam(torch.optim.Adam):
         touched = _sorted(self._touched[param])
         # Up to which step the rows' states are known; since then they decayed.
         missed = (step - 1) - np.minimum(moved[touched] + (rest - 1), step - 1)
+        for name, beta in zip(MEANS, group["betas"], strict=True):
+            state[name].numpy()[touched] *= np.power(np.float32(beta), missed)[:, None]
         moved[touched] = step
         before = self._moving[param]
-        last = moved[before.rows]
-        stays = (last > step - rest) & (last < step)
-        before.put_back(np.flatnonzero(~stays))
-        kept = np.flatnonzero(stays)
-        rows = np.concatenate([before.rows[kept], touched])
-        decayed = [state[name].numpy()[touched] for name in MEANS]
-        for mean, beta in zip(decayed, group["betas"], strict=True):
-            mean *= np.power(np.float32(beta), missed)[:, None]
-        means, squares = [
-            np.concatenate([mean.take(kept, axis=0), of_touched])
-            for mean, of_touched in zip(before.means, decayed, strict=True)
-        ]
+        # In one order, however they came together.
+        self._moving[param] = rows = _sorted([before[moved[before] > step - rest], touched])
         assert param.grad is not None
-        gradients = np.zeros_like(means)
-        gradients[len(rows) - len(touched) :] = param.grad.numpy()[touched]
-        values = param.detach().numpy().take(rows, axis=0)
-        parts = [[torch.from_numpy(array)] for array in (values, gradients, means, squares)]
+        arrays = [tensor.detach().numpy() for tensor in (param, *(state[name] for name in MEANS), param.grad)]
+        parts = [[torch.from_numpy(array.take(rows, axis=0))] for array in arrays]
         torch._fused_adam_(
             parts[0],
+            parts[3],
             parts[1],
             parts[2],
-            parts[3],
             [],
             [state["step"]],
             lr=group["lr"],  # which a schedule changes
@@ -172,8 +137,8 @@ class RowAdam(torch.optim.Adam):
             amsgrad=False,
             maximize=False,
         )
-        param.detach().numpy()[rows] = values
-        self._moving[param] = Moving(rows, [means, squares], before.kept)
+        for array, (changed,) in zip(arrays[:3], parts[:3], strict=True):
+            array[rows] = changed.numpy()
 
     def _prepared(self, param: Tensor, group: dict[str, Any]) -> dict[str, Tensor]:
         """The parameter's state, new or as a checkpoint of this optimizer or of Adam has it."""
@@ -184,27 +149,9 @@ class RowAdam(torch.optim.Adam):
         if "moved" not in state:  # the step of a row's last gradient
             state["moved"] = torch.full((len(param),), float(state["step"]))
             state["moved"] -= (state["exp_avg"] == 0).all(dim=1) * (rest - 1.0)
-        if param not in self._moving or not self._moving[param].is_of(state):
-            moved = state["moved"].numpy()
-            rows = np.flatnonzero(moved > float(state["step"]) + 1 - rest)
-            rows = rows[moved[rows].argsort(kind="stable")]
-            kept = [state[name] for name in MEANS]
-            self._moving[param] = Moving(rows, [mean.numpy()[rows] for mean in kept], kept)
+        if param not in self._moving:
+            self._moving[param] = np.flatnonzero(state["moved"].numpy() > float(state["step"]) + 1 - rest)
         return state
-
-    def state_dict(self) -> dict[str, Any]:
-        """As any optimizer's."""
-        self._put_back()
-        return super().state_dict()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What is copied."""
-        self._put_back()
-        return super().__getstate__()
-
-    def _put_back(self) -> None:
-        for moving in self._moving.values():
-            moving.put_back()
 
     def load_state_dict(self, state_dict: Any) -> None:
         """As any optimizer does; which groups are ``by_rows`` stays as it is."""
@@ -216,7 +163,6 @@ class RowAdam(torch.optim.Adam):
 
     def settle(self) -> None:
         """Bring all rows' states up to now: they are then those of `torch.optim.Adam`."""
-        self._put_back()
         settle(self)
         self._moving = {}
 
